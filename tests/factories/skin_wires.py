@@ -26,6 +26,7 @@ from palpate.io.skin_profile import SkinProfile
 from palpate.sim.rig import VirtualClock
 from tests.factories.paths import ROOT
 from tests.factories.skins import wires
+from tests.factories.skins.devices import on_wire
 
 FOLDER = ROOT / "firmware_config" / "skins"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.toml") if path.stem != "palpate")
@@ -45,6 +46,8 @@ def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
     """Raw counts of frame `i`: [R, C] or [R, C, A], different in every frame and taxel."""
     format = p.format
     shift = (np.arange(format.channels).reshape(format.shape) * 7 + i * 13) % 199
+    if "int8" in p.number.split():
+        shift %= 128
     return (shift / 4 if format.dtype == "float32" else shift).astype(format.numpy_type)
 
 
@@ -69,7 +72,9 @@ def wire(name: str, i: int, period_ns: float = 1e6) -> bytes:
     """Frame `i` of a packaged profile as bytes. period_ns: of its clock."""
     if name == "papillarray":
         return papillarray(numbers(profile(name), i), i, period_ns=period_ns)
-    data = wires.wire(name, 1e9 / period_ns).frame(taxels(profile(name), i), 0)
+    skin = wires.wire(name, 1e9 / period_ns)
+    frame = on_wire(taxels(profile(name), i), profile(name))
+    data = skin.encode(frame) if isinstance(skin, wires.Polled) else skin.frame(frame, 0)
     return VARIANTS.get(name, bytes)(data)
 
 

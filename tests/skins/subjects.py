@@ -51,6 +51,6 @@ def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
         # multiples of 0.25 are exact with two decimals
         values = rng.integers(-4000, 4000, (n, *format.shape)) / 4
     else:
-        most = 0xF9FF if name == "xela-can" else np.iinfo(format.dtype).max
+        most = {"xela-can": 0xF9FF, "paxini": 127}.get(name, np.iinfo(format.dtype).max)
         values = rng.integers(0, most + 1, (n, *format.shape))
     return Subject(name, profile, values.astype(format.numpy_type))

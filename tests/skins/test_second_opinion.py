@@ -14,6 +14,8 @@ import pytest
 from tests.factories.skins.played import Numbered, played
 
 FRAMES = 20
+ASKED = ("paxini", "synria", "dfrobot-tactile")
+"""Skins that answer with their newest frame, which may be asked for twice."""
 READERS = {
     "flexitac": """
 from flexitac import FlexiTacSensor
@@ -41,6 +43,23 @@ frames = list(seen.values())
 assert all(len(f.pressure) == 2 and f.accelerometer[1].tolist() == [0, 0, 16384] for f in frames)
 frames = [f.pressure for f in frames]
 """,
+    "paxini": """
+from paxini_sdk import SingleSensorBoard
+with SingleSensorBoard(port, n_points=9) as board:
+    frames = [[p.as_tuple() for p in board.read_distributed_force()] for _ in range(n)]
+""",
+    "synria": """
+from tactile_sdk import TactilePressureSDK
+sdk = TactilePressureSDK(port, 1, baudrate=4000000)
+sdk.connect()
+frames = [sdk.pressure.read_all().values for _ in range(n)]
+""",
+    "dfrobot-tactile": """
+from pymodbus.client import ModbusSerialClient
+client = ModbusSerialClient(port, baudrate=115200)
+assert client.connect()
+frames = [client.read_input_registers(7, count=32, device_id=1).registers for _ in range(n)]
+""",
 }
 """Each skin's reader, by its own documentation. ReSkin's text has no first frame: a reader joins in
 the middle of a line."""
@@ -65,8 +84,9 @@ def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
     numbers = [_number(frame, source) for frame in read]
     assert len(numbers) == FRAMES
     steps = np.diff(numbers) % 199
-    assert (steps >= 1).all()
-    assert np.median(steps) == 1  # a busy machine may make the reader drop what waited too long
+    assert (steps >= (name not in ASKED)).all()
+    if name not in ASKED:
+        assert np.median(steps) == 1  # a busy reader drops what waited too long
 
 
 def _number(frame: np.ndarray, source: Numbered) -> int:

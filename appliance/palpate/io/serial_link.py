@@ -35,7 +35,10 @@ full buffer."""
 
 
 class SerialLink:
-    """An opened serial port: requests are bytes, replies packets. wait: see `Devices`."""
+    """An opened serial port: requests are bytes, replies packets. wait: see `Devices`.
+
+    collect_ns: least time between two reads, 0 for a skin that waits for the next request.
+    """
 
     def __init__(
         self,
@@ -44,8 +47,9 @@ class SerialLink:
         clock: Clock,
         opener: Callable[..., Any] = serial.Serial,
         wait: Callable[[int, float], bool] = wait_readable,
+        collect_ns: int = COLLECT_NS,
     ) -> None:
-        self.path, self._clock, self._wait = path, clock, wait
+        self.path, self._clock, self._wait, self._collect_ns = path, clock, wait, collect_ns
         self._next_ns = 0  # time of the next read
         try:
             self._port = serial_port.open_alone(path, baud, opener)
@@ -85,7 +89,7 @@ class SerialLink:
             raise _lost(self.path, OSError(errno.ENODEV, "end of file"))
         # 2; from half of the buffer on 1; 0 for a full buffer
         parts = 2 - 2 * len(data) // TTY_BYTES
-        self._next_ns = self._clock.now_ns() + max(0, parts) * COLLECT_NS // 2
+        self._next_ns = self._clock.now_ns() + max(0, parts) * self._collect_ns // 2
         return data
 
     def close(self) -> None:

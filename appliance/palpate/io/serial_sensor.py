@@ -19,11 +19,17 @@ from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, serial_port, skin_stream
 from palpate.io.link import SkinLink
 from palpate.io.sensor import TransferObserver
-from palpate.io.serial_link import SerialLink, find
+from palpate.io.serial_link import COLLECT_NS, SerialLink, find
 from palpate.io.serial_port import PortInfo
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.skin_stream import RATE_WANDER
 from palpate.io.usb_sensor import LinkSensor
+
+ANSWER_NS = 100_000_000
+"""A request that was not answered for so long is lost."""
+QUIET_NS = 2_000_000
+"""An answer has ended once nothing has come for so long. A request before its end would disturb it
+on a line that both sides share."""
 
 
 class BytePort(Protocol):
@@ -41,7 +47,7 @@ class ProfileLink:
 
     def __init__(self, port: BytePort, stop: Iterable[bytes]) -> None:
         self._port, self._stop = port, list(stop)
-        self.read = port.read
+        self.read: Callable[[int, int], bytes] = port.read
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """Raises SensorMismatch: these skins do not answer requests."""
@@ -56,6 +62,65 @@ class ProfileLink:
             for command in self._stop:
                 self._port.write(command)
         self._port.close()
+
+
+class PollingLink(ProfileLink):
+    """A port whose skin sends a frame when it is asked. polls: the requests of a frame, evenly
+    spaced within `period_ns`. The next waits for the end of the last answer."""
+
+    def __init__(
+        self,
+        port: BytePort,
+        stop: Iterable[bytes],
+        polls: list[bytes],
+        period_ns: int,
+        clock: Clock,
+    ) -> None:
+        super().__init__(port, stop)
+        self.read = self._read
+        self._polls, self._slot_ns, self._clock = polls, period_ns // len(polls), clock
+        self._next, self._next_ns, self._waits_until_ns = 0, clock.now_ns(), 0
+
+    def _read(self, size: int, timeout_ms: int) -> bytes:
+        """As `SkinLink.read`, asking in between."""
+        until_ns = self._clock.now_ns() + timeout_ms * 1_000_000
+        while (now_ns := self._clock.now_ns()) < until_ns:
+            due_ns = max(self._next_ns, self._waits_until_ns)
+            if now_ns >= due_ns:
+                self._port.write(self._polls[self._next])
+                self._next = (self._next + 1) % len(self._polls)
+                self._next_ns = max(self._next_ns + self._slot_ns, now_ns)
+                self._waits_until_ns = now_ns + ANSWER_NS
+                continue
+            if data := self._port.read(size, max(1, (min(due_ns, until_ns) - now_ns) // 1_000_000)):
+                self._waits_until_ns = self._clock.now_ns() + QUIET_NS
+                return data
+        return b""
+
+
+def started(port: BytePort, profile: SkinProfile, rate_hz: float, clock: Clock) -> ProfileLink:
+    """An open port whose skin got its start commands, and is asked for frames if its profile says
+    so. Raises SensorError."""
+    for command in profile.commands(profile.start, rate_hz):
+        port.write(command)
+    stop = profile.commands(profile.stop, rate_hz)
+    if polls := requests(profile):
+        return PollingLink(port, stop, polls, round(1e9 / rate_hz), clock)
+    return ProfileLink(port, stop)
+
+
+def requests(profile: SkinProfile) -> list[bytes]:
+    """The requests of a frame; none for a skin that sends by itself."""
+    if profile.codec == "modbus":
+        from palpate.io.skin_codecs import modbus
+
+        return modbus.requests(profile)
+    return profile.commands(profile.poll, profile.rate_hz)
+
+
+def collect_ns(profile: SkinProfile) -> int:
+    """Least time between two reads: none while a skin waits for the next request."""
+    return 0 if requests(profile) else COLLECT_NS
 
 
 class SerialSensor(LinkSensor):
@@ -78,7 +143,9 @@ class SerialSensor(LinkSensor):
         made = partial(skin_stream.stream, profile, format)
         super().__init__(config, format, clock, made, tap)
         self._profile, self._ports = profile, ports
-        self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
+        self._open_port = open_port or (
+            lambda path, baud: SerialLink(path, baud, clock, collect_ns=collect_ns(profile))
+        )
         self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
 
     def _proven(self, now_ns: int) -> bool:
@@ -92,17 +159,14 @@ class SerialSensor(LinkSensor):
         info = next((port for port in there if port.path in (path, node)), PortInfo(path))
         port = self._open_port(path, self._profile.baud)
         try:
-            rate = self._format.rate_hz
-            for command in self._profile.commands(self._profile.start, rate):
-                port.write(command)
+            link = started(port, self._profile, self._format.rate_hz, self._clock)
             if self._config.tare:
-                for command in self._profile.commands(self._profile.tare, rate):
+                for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
                     port.write(command)
                 self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
         except Exception:
             port.close()
             raise
-        link = ProfileLink(port, self._profile.commands(self._profile.stop, self._format.rate_hz))
         return link, packets.Identity(0, (0, 0, 0), self._config.profile, info.serial)
 
     def _check_format(self) -> None:

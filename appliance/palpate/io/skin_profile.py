@@ -70,8 +70,10 @@ def _is_command(value: Any) -> bool:
 
 
 def _binary(value: str) -> bool:
+    for name in ("period_ms", "bytes", *checksums.NAMED):
+        value = value.replace(f"{{{name}}}", "00")
     try:
-        return bool(bytes.fromhex(value[4:].replace("{period_ms}", "00")))
+        return bool(bytes.fromhex(value[4:]))
     except ValueError:
         return False
 
@@ -93,6 +95,12 @@ def _checksum() -> Any:
     return custom("", f'"", {names}, or parameters: "crc8 poly=1d init=ff xorout=00"', read)
 
 
+def _number() -> Any:
+    types = ", ".join(f'"{kind}"' for kind in wire_numbers.TYPES)
+    several = 'or one for each value of a taxel: "int8 int8 uint8"'
+    return custom("uint8", f"one of {types}, {several}", wire_numbers.known)
+
+
 def _text(most: int) -> Any:
     def read(value: Any) -> str | None:
         fits = isinstance(value, str) and len(value) <= most and value.isprintable()
@@ -112,7 +120,8 @@ class SkinProfile:
     about: a line of description. source: where the facts are from. measured: who has compared them
     with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
     stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
-    skin, which takes tare_s. codec: how frames are recognized. unit: of its numbers, "" for raw
+    skin, which takes tare_s. poll: requests of a frame, sent rate_hz times a second, for skins that
+    answer when asked. codec: how frames are recognized. unit: of its numbers, "" for raw
     counts.
 
     "fixed": marker, trailer: bytes before and after a frame. skip_before, skip_after: ignored bytes
@@ -122,10 +131,19 @@ class SkinProfile:
     the marker; it covers all bytes up to itself. byte_order: of a number on the wire;
     sequence_order, checksum_order: of these, "" for byte_order.
 
-    "text": lines: content of a line. skip_columns: numbers of a line that are ignored, counted from
-    0. prefix: the beginning of all lines of numbers; others are passed over. around: the
-    characters of a line without its numbers, separators and brackets. decimal: the
-    decimal mark. line_end: the character that ends a line.
+    "segments": the keys of "fixed" without those of a count. A frame has one part or several.
+    length: type of a part's length, length_at: its first byte, counted from the end of the marker;
+    length_of: its unit. segment: numbers of a part without a length, 0 for a whole frame. index:
+    type of the number of a part, which rises within a frame, index_at: its first byte. zeros: after
+    a 0 comes the number of zeros that it stands for.
+
+    "modbus": unit_id, function (3 or 4), register: the first that holds numbers, big-endian.
+
+    "text": lines: content of a line. index: the beginning of a line, with # in the place of its
+    number, or of its row and its column. skip_columns: numbers of a line that are ignored, counted
+    from 0. prefix: the beginning of all lines of numbers; others are passed over. around: the
+    characters of a line without its numbers, separators and brackets. decimal: the decimal mark.
+    line_end: the character that ends a line.
 
     number: type of a number on the wire. values: numbers of one taxel there. take: indices of those
     that are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on
@@ -137,12 +155,15 @@ class SkinProfile:
     source: str = ""
     measured: str = ""
     unit: str = _text(16)
-    codec: Literal["palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf"] = "palpate"
+    codec: Literal[
+        "palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf", "segments", "modbus"
+    ] = "palpate"
     usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
     baud: int = limited(115200, 1200, 4_000_000)
     start: tuple[str, ...] = _several(
         'commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command
     )
+    poll: tuple[str, ...] = _several('commands such as ["r"] or ["hex:01 42"]', _is_command)
     stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _is_command)
     tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _is_command)
     tare_s: float = limited(0.0, 0.0, 60.0)
@@ -156,13 +177,23 @@ class SkinProfile:
     checksum: str = _checksum()
     checksum_from: int = limited(0, 0, 4096)
     checksum_order: Literal["", "little", "big"] = ""
-    lines: Literal["rows", "frames"] = "rows"
+    index: str = _text(64)
+    index_at: int = limited(0, 0, 4096)
+    length: Literal["", "uint8", "uint16", "uint32"] = ""
+    length_at: int = limited(0, 0, 4096)
+    length_of: Literal["bytes", "numbers"] = "bytes"
+    segment: int = limited(0, 0, 1 << 16)
+    zeros: bool = False
+    unit_id: int = limited(1, 0, 255)
+    function: Literal[3, 4] = 3
+    register: int = limited(0, 0, 65535)
+    lines: Literal["rows", "frames", "taxels"] = "rows"
     skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
     prefix: str = _text(64)
     around: str = _text(16384)
     decimal: Literal[".", ","] = "."
     line_end: Literal["\n", "\r"] = "\n"
-    number: wire_numbers.WireNumber = "uint8"
+    number: str = _number()
     byte_order: Literal["little", "big"] = "little"
     rows: int = limited(4, 1, 255)
     cols: int = limited(4, 1, 255)
@@ -187,14 +218,21 @@ class SkinProfile:
     def lacks(self) -> tuple[str, ...]:
         """The MARKS that its frames lack. Without a sequence losses cannot be seen."""
         has: tuple[str, ...] = MARKS if self.codec in ("palpate", "papillarray") else ()
-        if self.codec == "fixed":
+        if self.codec == "modbus":
+            has = ("checksum",)
+        if self.codec in ("fixed", "segments"):
             has = ("sequence",) * bool(self.sequence) + ("checksum",) * bool(self.checksum)
         return tuple(mark for mark in MARKS if mark not in has)
 
     @property
     def body(self) -> int:
-        """Bytes of the numbers of a frame on the wire, for "fixed"."""
-        return self.rows * self.cols * self.values * wire_numbers.size(self.number)
+        """Bytes of the numbers of a frame on the wire."""
+        return self.numbers * wire_numbers.size(self.number)
+
+    @property
+    def numbers(self) -> int:
+        """Numbers of a frame on the wire."""
+        return self.rows * self.cols * self.values
 
     @property
     def data_type(self) -> str:
@@ -209,16 +247,30 @@ class SkinProfile:
 
     def commands(self, texts: Sequence[str], rate_hz: float) -> list[bytes]:
         """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds:
-        decimal in a text, one byte in a command that begins with hex:."""
+        decimal in a text, one byte in a command that begins with hex:. There, {bytes} becomes
+        the size of a frame's numbers, and {crc8} or another name this checksum of all bytes before.
+        """
         period = max(1, min(255, round(1000 / rate_hz)))
         return [
-            bytes.fromhex(text[4:].replace("{period_ms}", f"{period:02x}"))
+            self._binary(text[4:].replace("{period_ms}", f"{period:02x}"))
             if text.startswith("hex:")
             else text.replace("{rate}", f"{rate_hz:g}")
             .replace("{period_ms}", str(period))
             .encode("latin-1", "replace")
             for text in texts
         ]
+
+    def _binary(self, text: str) -> bytes:
+        body = self.body.to_bytes(2, self.byte_order)
+        before, sign, after = text.replace("{bytes}", body.hex()).partition("{")
+        data = bytes.fromhex(before)
+        if not sign:
+            return data
+        name, _, rest = after.partition("}")
+        checksum = checksums.NAMED[name]
+        order = self.checksum_order or self.byte_order
+        order = "little" if self.codec == "modbus" else order
+        return data + checksum.of(data).to_bytes(checksum.size, order) + bytes.fromhex(rest)
 
     def json(self) -> dict[str, Any]:
         """All fields by name, for JSON; `from_json` reads them."""
@@ -229,14 +281,17 @@ class SkinProfile:
 
 
 _KEYS = keys(SkinProfile)
+_BINARY = ("fixed", "segments")
 _OF_CODEC = {
-    "fixed": (
-        *("marker", "trailer", "skip_before", "skip_after", "sequence", "sequence_at"),
-        *("sequence_order", "checksum", "checksum_from", "checksum_order"),
-    ),
-    "text": ("skip_columns", "prefix", "around", "decimal", "line_end"),
+    "marker trailer skip_before skip_after": _BINARY,
+    "checksum checksum_from checksum_order": _BINARY,
+    "sequence sequence_at sequence_order": ("fixed",),
+    "length length_at length_of segment zeros index_at": ("segments",),
+    "index": ("segments", "text"),
+    "unit_id function register": ("modbus",),
+    "skip_columns prefix around decimal line_end": ("text",),
 }
-"""Keys that belong to one codec."""
+"""Keys that belong to some codecs."""
 _VALUES = {"papillarray": (6, "float32"), "xela-can": (3, "uint16"), "robotiq-tsf": (1, "uint16")}
 """Numbers of a taxel and their type, in the codecs that define them."""
 
@@ -245,25 +300,17 @@ def _contradiction(p: SkinProfile) -> str:
     """The contradiction between these values, "" for none."""
     if p.codec == "fixed" and not (p.marker or p.trailer):
         return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
-    for codec, names in _OF_CODEC.items():
-        if codec != p.codec and (wrong := [n for n in names if getattr(p, n) != _KEYS[n].default]):
-            return f'only codec = "{codec}" has {" and ".join(wrong)}; remove it from "{p.codec}"'
-    if p.prefix and p.lines == "rows":
-        return f'prefix = "{p.prefix}" needs a frame on each line; set lines = "frames"'
-    if why := _outside(p):
+    for names, codecs in _OF_CODEC.items():
+        wrong = [n for n in names.split() if getattr(p, n) != _KEYS[n].default]
+        if wrong and p.codec not in codecs:
+            only = " and ".join(f'codec = "{codec}"' for codec in codecs)
+            return f'only {only} has {" and ".join(wrong)}; remove it from "{p.codec}"'
+    if why := _outside(p) or _of_parts(p) or _of_numbers(p):
         return why
-    if p.codec != "fixed" and p.number in wire_numbers.WIDE:
-        return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
-    take = {*p.take}
-    if not 0 < len(p.take) == len(take) <= MOST_AXES or max(take) >= p.values:
-        allowed = f"1 to {MOST_AXES} different ones of 0 to {p.values - 1}"
-        return f"take = {list(p.take)} is not {allowed}; number the wanted values"
-    if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
-        values, kind = _VALUES[p.codec]
-        return f'codec = "{p.codec}" needs values = {values} and number = "{kind}"'
-    if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
+    if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare or p.poll):
         return (
-            'usb_ids, start, stop and tare are not for codec = "palpate"; see skin.link, skin.usb'
+            'usb_ids, start, stop, poll and tare are not for codec = "palpate"; see skin.link,'
+            " skin.usb"
         )
     if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
         sizes = "neither one finger (7 x 4) nor two (14 x 4)"
@@ -271,9 +318,65 @@ def _contradiction(p: SkinProfile) -> str:
     return ""
 
 
+def _of_numbers(p: SkinProfile) -> str:
+    """Why the numbers of a taxel do not fit, "" if they do."""
+    kinds = len(p.number.split())
+    if kinds not in (1, p.values):
+        return f'number = "{p.number}" has {kinds} types for {p.values} values; give one for each'
+    binary = (*_BINARY, "modbus")
+    if p.codec not in binary and any(kind not in wire_numbers.KEPT for kind in p.number.split()):
+        return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
+    if p.codec == "modbus" and wire_numbers.size(p.number) not in (2, 4):
+        return f'number = "{p.number}" fills no register; write number = "uint16"'
+    take = {*p.take}
+    if not 0 < len(p.take) == len(take) <= MOST_AXES or max(take) >= p.values:
+        allowed = f"1 to {MOST_AXES} different ones of 0 to {p.values - 1}"
+        return f"take = {list(p.take)} is not {allowed}; number the wanted values"
+    if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
+        values, kind = _VALUES[p.codec]
+        return f'codec = "{p.codec}" needs values = {values} and number = "{kind}"'
+    return ""
+
+
+def _of_parts(p: SkinProfile) -> str:
+    """The contradiction between keys of parts, "" for none."""
+    if p.codec == "text":
+        if p.prefix and (p.index or p.lines == "rows"):
+            wanted = "write it into index" if p.index else 'set lines = "frames"'
+            return f'prefix = "{p.prefix}" needs a frame on each line; {wanted}'
+        if p.index and p.index.count("#") not in (1, 2):
+            return f'index = "{p.index}" needs # for the number of the line; write "R#:" or "#,"'
+        if p.lines == "taxels" and not p.index:
+            return 'lines = "taxels" needs the number of a taxel; give its place, as index = "#,"'
+        if p.index and p.lines == "frames":
+            return f'index = "{p.index}" needs a part on each line; set lines = "rows" or "taxels"'
+    if p.codec != "segments":
+        return ""
+    if not p.marker:
+        return 'codec = "segments" needs a marker; give the bytes that begin a part'
+    if p.index not in ("", *FIELD_BYTES):
+        return f'index = "{p.index}" is no type; write one of {", ".join(FIELD_BYTES)}'
+    for key, kind, at in (("index", p.index, p.index_at), ("length", p.length, p.length_at)):
+        if kind and at + FIELD_BYTES[kind] > p.skip_before:
+            return f"{key}_at = {at} is among the numbers; count its bytes in skip_before"
+    if p.segment not in (0, p.numbers) and not p.index:
+        return f"segment = {p.segment} needs the type of a part's number; give one as index"
+    if p.zeros and ("float" in p.number or " " in p.number):
+        return f'number = "{p.number}" has no runs of zeros; write zeros = false'
+    if p.segment > p.numbers:
+        return f"segment = {p.segment} is more than a frame of {p.numbers}; correct rows and cols"
+    return ""
+
+
+FIELD_BYTES = {"uint8": 1, "uint16": 2, "uint32": 4}
+"""Bytes of a length or of the number of a part."""
+
+
 def _outside(p: SkinProfile) -> str:
     """Why a part of a frame of fixed length lies where it cannot lie, "" if none does."""
     end = p.skip_before + p.body
+    if p.codec != "fixed":
+        end = 1 << 20  # parts of a frame differ in length
     if p.sequence_at and not p.sequence:
         return 'sequence_at needs the type of the count; give one, such as sequence = "uint8"'
     if not (p.sequence_at <= p.skip_before or end <= p.sequence_at <= end + p.skip_after):

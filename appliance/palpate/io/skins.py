@@ -44,10 +44,12 @@ def sensor(
         return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
     # boxes whose skin speaks PROTOCOL.md do without these modules
     from palpate.io.serial_link import SerialLink
-    from palpate.io.serial_sensor import SerialSensor
+    from palpate.io.serial_sensor import SerialSensor, collect_ns
 
     def opened(path: str, baud: int) -> SerialLink:
-        return SerialLink(path, baud, devices.clock, wait=devices.wait)
+        return SerialLink(
+            path, baud, devices.clock, wait=devices.wait, collect_ns=collect_ns(chosen)
+        )
 
     return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
 

@@ -3,9 +3,9 @@ ids, then by listening. Commands are written only to a port that the user has na
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,9 +14,9 @@ from palpate.core.config import SkinConfig
 from palpate.core.errors import FormatError, SensorError
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, skin_codecs, wire_numbers
-from palpate.io.link import reply_to
+from palpate.io.link import SkinLink, reply_to
 from palpate.io.serial_port import PortInfo
-from palpate.io.serial_sensor import BytePort
+from palpate.io.serial_sensor import BytePort, requests, started
 from palpate.io.skin_codecs import Rest
 from palpate.io.skin_profile import DEFAULT, SkinProfile
 from palpate.tools import skin_text
@@ -37,8 +37,9 @@ OpenPort = Callable[[str, int], BytePort]
 
 
 LINES = (
-    "let it print equal lines of numbers; if it waits for a command, describe it with `start`, as"
-    " matrix.toml explains"
+    "let it print equal lines of numbers, or describe them as matrix.toml explains: `start` or"
+    " `poll` for what it waits for, `prefix` or `index` for how its lines begin; lines of what has"
+    " changed cannot be described, so print all taxels"
 )
 """The remedy for text that is no lines of numbers."""
 
@@ -128,7 +129,10 @@ def _on_port(
         others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)
     ):
         these = {name: p for name, p in others.items() if p.baud == baud}
-        for starter in [None, *(n for n in these if write and these[n].start)]:
+        for starter in [
+            None,
+            *(n for n in these if write and (these[n].start or requests(these[n]))),
+        ]:
             by = these[starter] if starter else None
             heard[baud] = listen(port.path, baud, by, open_port, clock, seconds)
             if fitting := [n for n in these if fits(these[n], heard[baud])]:
@@ -175,23 +179,14 @@ def listen(
     clock: Clock,
     seconds: float,
 ) -> HeardBytes:
-    """The bytes of a port. starter: its start and stop are written. Raises SensorError."""
+    """The bytes of a port. starter: its commands and requests are written. Raises SensorError."""
     port = open_port(path, baud)
-    reads: list[tuple[bytes, int]] = []
-    try:
-        for command in starter.commands(starter.start, starter.rate_hz) if starter else ():
-            port.write(command)
-        reads = collect(port, clock, seconds)
-    finally:
-        with contextlib.suppress(SensorError):
-            for command in starter.commands(starter.stop, starter.rate_hz) if starter else ():
-                port.write(command)
-        port.close()
-    return HeardBytes(reads)
+    with closing(started(port, starter, starter.rate_hz, clock) if starter else port) as link:
+        return HeardBytes(collect(link, clock, seconds))
 
 
 def collect(
-    port: BytePort, clock: Clock, seconds: float, boot_s: float = 0.0
+    port: BytePort | SkinLink, clock: Clock, seconds: float, boot_s: float = 0.0
 ) -> list[tuple[bytes, int]]:
     """The reads of an open port within `seconds` of its first byte, with their times. boot_s: time
     beyond `seconds` in which the first byte may come. Raises SensorError."""
@@ -275,11 +270,16 @@ def _nothing(
     if heard.data:
         return (
             f"sends {len(heard.data)} bytes, but no frames of a profile; try skin.grid, or copy"
-            " matrix.toml, describe the frames there and check it with `palpate skin check`"
+            " matrix.toml, write marker, number, rows and cols (length, index and zeros for frames"
+            " in parts) there and check it with `palpate skin check`; frames without a marker or of"
+            " changes alone cannot be described: send a marker and all taxels"
         )
     if write:
-        return "sends nothing and answers nothing"
-    asking = ", ".join(name for name, p in profiles.items() if p.start)
+        return (
+            "sends nothing and answers nothing; if it waits for a request of its own, copy"
+            " matrix.toml and write it there as `poll`"
+        )
+    asking = ", ".join(name for name, p in profiles.items() if p.start or requests(p))
     return (
         f"sends nothing unasked; {asking} and boards of PROTOCOL.md may have to be asked: add"
         " --write --port with its path"

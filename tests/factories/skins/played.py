@@ -22,6 +22,10 @@ SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
     "papillarray": ((3, 3, 3), "float32", 1000.0),
     "xela-can": ((4, 4, 3), "uint16", 100.0),
     "robotiq-tsf": ((14, 4), "uint16", 62.5),
+    "paxini": ((3, 3, 3), "int16", 50.0),
+    "synria": ((10, 6), "uint16", 100.0),
+    "dfrobot-tactile": ((4, 8), "uint16", 50.0),
+    "bota-serial": ((1, 1, 3), "float32", 100.0),
 }
 """Shape, data type and rate of each skin in its maker's default."""
 
@@ -31,12 +35,13 @@ class Numbered:
 
     def __init__(self, name: str) -> None:
         self.shape, dtype, self.rate_hz = SHAPES[name]
+        self._share = 2 if name == "paxini" else 1  # its forces end at 127
         self.dtype = np.dtype(dtype)
 
     def frame(self, i: int, frame_ns: Callable[[int], int] = lambda i: 0) -> NDArray[Any]:
         """Frame `i`. Frame i + 199 is the same."""
         cells = np.arange(np.prod(self.shape)).reshape(self.shape)
-        values = (i % 199) + 3 * cells % 50
+        values = ((i % 199) + 3 * cells % 50) // self._share
         return (values / 4 - 20 if self.dtype.kind == "f" else values).astype(self.dtype)
 
 

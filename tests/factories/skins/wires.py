@@ -86,6 +86,73 @@ def rows(taxels: Taxels) -> bytes:
     return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
+class Polled(Wire):
+    """A skin that answers requests with its newest frame. request: the bytes that ask for it."""
+
+    def __init__(self, encode: Callable[[Taxels], bytes], request: bytes, rate_hz: float) -> None:
+        super().__init__(encode, rate_hz)
+        self._request, self._rest, self._newest, self._owed = request, b"", b"", 0
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """The answers to requests before the first frame; else the frame is kept."""
+        self._newest = self.encode(taxels)
+        owed, self._owed = self._owed, 0
+        return self._newest * owed
+
+    def receive(self, data: bytes) -> bytes:
+        """The newest frame for each whole request."""
+        *asked, self._rest = (self._rest + data).split(self._request)
+        self._owed += 0 if self._newest else len(asked)
+        return self._newest * len(asked)
+
+
+def paxini(taxels: Taxels) -> bytes:
+    """PaXini's serial converter. Source: paxini-sdk 0.1.0, protocol.py; its board sets the state to
+    1 in good answers, too."""
+    force = taxels.reshape(-1).astype("i2").astype("u1").tobytes()
+    head = struct.pack("<HBBBIHB", len(force) + 10, 1, 0, 0xFB, 0x40E, len(force), 1)
+    data = b"\xaa\x55" + head + force
+    return data + bytes([-sum(data) & 0xFF])
+
+
+def crc16(data: bytes) -> bytes:
+    """The checksum of Modbus RTU, bit by bit."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0xA001 * (value & 1)
+    return value.to_bytes(2, "little")
+
+
+def synria(taxels: Taxels) -> bytes:
+    """Synria's answer to function 42. Source: tactile-pressure-sdk 2.0.0, modbus_rtu.py."""
+    counts = taxels.astype("<u2").tobytes()
+    data = struct.pack("<BBH", 1, 0x42, len(counts)) + counts
+    return data + crc16(data)
+
+
+def dfrobot(taxels: Taxels) -> bytes:
+    """DFRobot's array: all input registers from 7 on; its own library turns the rows around.
+
+    Source: DFRobot_Tactile, python/raspberrypi.
+    """
+    counts = taxels.astype(">u2").tobytes()
+    data = struct.pack("BBB", 1, 4, len(counts)) + counts
+    return data + crc16(data)
+
+
+def bota(taxels: Taxels) -> bytes:
+    """Bota's frame: state, six floats, time, temperature. Source: the maker's serial driver."""
+    data = struct.pack("<H6fIf", 0, *taxels.reshape(-1).astype(float), 0, 0, 0, 7, 25.0)
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0x8408 * (value & 1)
+    return b"\xaa" + data + (value ^ 0xFFFF).to_bytes(2, "little")
+
+
 class PapillArray(Wire):
     """Contactile's PapillArray controller (PTS 2.0). Frames [3 S, 3, 3]: S sensors of 3 x 3 pillars
     with Fx, Fy, Fz in N.
@@ -305,6 +372,10 @@ WIRES: Mapping[str, Callable[[float], Wire]] = {
     "papillarray": PapillArray,
     "xela-can": Slcan,
     "robotiq-tsf": Robotiq,
+    "paxini": partial(Polled, paxini, bytes.fromhex("55aa09000100fb0e0400001b00cf")),
+    "synria": partial(Polled, synria, b"\x01\x42\x80\x11"),
+    "dfrobot-tactile": partial(Polled, dfrobot, bytes.fromhex("0104000700204013")),
+    "bota-serial": partial(Wire, bota),
 }
 """The wire of each skin, by the name of its profile, for a rate in frames per second."""
 

@@ -11,7 +11,7 @@ import pytest
 
 from palpate.core.config import SkinConfig
 from palpate.core.types import EPOCH_BITS
-from palpate.io.serial_sensor import SerialSensor
+from palpate.io.serial_sensor import SerialSensor, requests
 from tests.factories.costly import quick_first
 from tests.factories.skin_wires import NAMES, PATH, SECOND, WiredSkin, profile, taxels, wire
 
@@ -260,12 +260,16 @@ def test_back_pressure(name):
 
 @each
 def test_commands(name):
-    """Only the profile's commands are written at start and end; a tare only if it is set."""
+    """Only the profile's commands are written at start and end, and its requests in between; a
+    tare only if it is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.sensor.close()
     p, rate = skin.profile, skin.format.rate_hz
-    assert skin.port.sent == p.commands(p.start, rate) + p.commands(p.stop, rate)
+    asked = [data for data in skin.port.sent if data in requests(p)]
+    others = [data for data in skin.port.sent if data not in requests(p)]
+    assert others == p.commands(p.start, rate) + p.commands(p.stop, rate)
+    assert len(asked) == pytest.approx(rate if requests(p) else 0, abs=2)
     assert not skin.port.is_open
 
 

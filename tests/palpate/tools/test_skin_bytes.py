@@ -129,7 +129,7 @@ def test_the_commands(tmp_path, capsys):
         for i in range(10**6):
             if stop.wait(0.01):
                 return
-            os.write(far, b"%d %d\n" % (i % 7, i % 5))
+            os.write(far, b"%d %d\n" % (3 * i % 7, 3 * i % 5))
 
     with pseudo_terminal.pair() as (far, path):
         sender = threading.Thread(target=send, args=(far,), daemon=True)

@@ -21,6 +21,8 @@ EXTRAS = {
     "python_calamine": "files",
     "nptdms": "files",
     "rosbags": "files",
+    "zarr": "files",
+    "mcap": "files",
     "distributed": "dask",
 }
 """The extra of each library, as in train/pyproject.toml."""

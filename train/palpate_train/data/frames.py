@@ -386,22 +386,22 @@ def _named(name: str, names: Sequence[str], option: str) -> int:
 
 
 def _is_fact(table: Table, name: str) -> bool:
-    """Whether --field means a fact about the whole recording. A column of the name comes first."""
-    return normal(name) in table.facts and normal(name) not in table.columns
+    """Whether --field means a fact or texts beside the frames. A column of the name comes first."""
+    known = {*table.facts, *table.labels}
+    return normal(name) in known and normal(name) not in table.columns
 
 
 def fields(
     table: Table, given: Mapping[str, str], count: int
 ) -> list[tuple[slice, dict[str, str]]]:
-    """The parts of a table within which the columns `given` by field do not change, and the fields
-    of each part. A fact holds for all frames. Of a date with a clock time, the day counts.
-    Raises FormatError for an empty cell."""
-    if not given:
-        return [(slice(0, count), {})]
+    """The parts of a table within which the columns `given` by field do not change and no recording
+    ends, and the fields of each part. A fact holds for all frames. Of a date with a clock time, the
+    day counts. Raises FormatError for an empty cell."""
     columns: dict[str, list[str]] = {}
     for name, column in given.items():
         if _is_fact(table, column):
-            columns[name] = [table.facts[normal(column)]] * count
+            known = normal(column)
+            columns[name] = list(table.labels.get(known, ())) or [table.facts[known]] * count
             continue
         if not table.columns and table.facts:
             listed = ", ".join(map(printable, table.facts))
@@ -416,9 +416,10 @@ def fields(
         if "" in texts:
             raise FormatError(f"frame {texts.index('') + 1} has no {name} in column {column}")
         columns[name] = texts
-    rows = list(zip(*columns.values(), strict=True))
-    starts = [0, *(k for k in range(1, len(rows)) if rows[k] != rows[k - 1])]
+    rows = list(zip(*columns.values(), strict=True)) if columns else [()] * count
+    ends = {*table.ends}
+    starts = [0, *(k for k in range(1, count) if rows[k] != rows[k - 1] or k in ends)]
     return [
         (slice(a, b), dict(zip(columns, rows[a], strict=True)))
-        for a, b in zip(starts, [*starts[1:], len(rows)], strict=True)
+        for a, b in zip(starts, [*starts[1:], count], strict=True)
     ]

@@ -24,6 +24,7 @@ from palpate.core.text import printable
 from palpate.core.types import DATA_TYPES
 from palpate_train.data import frames, labels, lerobot, number_types, raw_files, readers, sampling
 from palpate_train.data.file_names import NamePattern, group
+from palpate_train.data.files import zarr_store
 from palpate_train.data.files.table import MOST_LISTED, ReadPlan, Table, normal
 from palpate_train.data.import_plan import ImportPlan
 from palpate_train.data.progress import Progress
@@ -172,7 +173,9 @@ def _named(
 
     Materials have their new names. Files that only systems and editors read are passed over.
     """
-    paths = {normal(p.relative_to(folder).as_posix()): p for p in readers.files_below(folder)}
+    inside = [folder] if zarr_store.is_store(folder) else readers.files_below(folder)
+    root = folder.parent if inside == [folder] else folder
+    paths = {normal(p.relative_to(root).as_posix()): p for p in inside}
     found: dict[str, tuple[Path, Fields]] = {}
     for name, path in paths.items():
         fields = _fields_of(name, plan)

@@ -27,6 +27,7 @@ from palpate_train.data.files import (
     tdms,
     tekscan,
     text,
+    zarr_store,
 )
 from palpate_train.data.files.table import ReadPlan, Table
 from palpate_train.data.readers import HDF5
@@ -41,9 +42,10 @@ BINARY: Mapping[tuple[str, ...], Reader] = {
     parquet.SUFFIXES: parquet.read,
     (".tdms",): tdms.read,
     bags.SUFFIXES: bags.read,
+    zarr_store.SUFFIXES: zarr_store.read,
 }
 """Readers by the suffixes of their files. Other files are HDF5 or text."""
-LIBRARIES = (sheets.read, parquet.read, tdms.read, bags.read)
+LIBRARIES = (sheets.read, parquet.read, tdms.read, bags.read, zarr_store.read)
 DAMAGED = (
     *UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
 )  # fmt: skip
@@ -74,7 +76,7 @@ REMEDIES = {
     (".edf", ".bdf", ".gdf"): "a biosignal recording; export it as CSV",
     (".slx", ".m", ".mlx", ".mlapp"): "a program of MATLAB; save its data with -v7",
     (".lvbit", ".vi"): "a program of LabVIEW; save its data as .lvm or .tdms",
-    (".zarr", ".nc", ".cdf"): "not read here; export the array as HDF5 or .npy",
+    (".nc", ".cdf"): "not read here; export the array as HDF5 or .npy",
 }
 """What to do with formats that we do not read, by suffix."""
 MAGIC = {
@@ -116,6 +118,8 @@ def arrays_of(path: Path) -> tuple[str, ...]:
 def _read(path: Path, wanted: ReadPlan) -> Table:
     suffix = path.suffix.lower()
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
+    if zarr_store.is_store(path):
+        reader = zarr_store.read
     if reader in LIBRARIES:
         try:
             return reader(path, wanted)

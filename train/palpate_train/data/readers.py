@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from palpate.core.sweep_set import Array, Set, build, load_file
 from palpate.core.types import LARGEST_READING, SweepFormat
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import mapped
+from palpate_train.data.files import zarr_store
 from palpate_train.data.group_values import typed
 
 if TYPE_CHECKING:
@@ -235,15 +237,16 @@ def check_folder(folder: Path) -> None:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """All files in and below a folder, in the order of their names, without those of JUNK."""
-    return sorted(
-        path
-        for path in folder.rglob("*")
-        if not any(
-            part in JUNK or part.startswith((".", "~$")) for part in path.relative_to(folder).parts
-        )
-        and path.is_file()
-    )
+    """All files in and below a folder, in the order of their names, without those of JUNK. A Zarr
+    store counts as a file."""
+    found = []
+    for at, folders, names in os.walk(folder):
+        stores = [name for name in folders if zarr_store.is_store(Path(at) / name)]
+        kept = [n for n in (*names, *folders) if n not in JUNK and not n.startswith((".", "~$"))]
+        folders[:] = [name for name in folders if name in kept and name not in stores]
+        paths = [Path(at) / name for name in kept if name not in folders]
+        found += [path for path in paths if path.is_file() or path.name in stores]
+    return sorted(found)
 
 
 def _advice(folder: Path) -> str:

@@ -73,6 +73,75 @@ def arranged(profile: SkinProfile, numbers: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(grid, np.dtype(profile.data_type).newbyteorder("<"))
 
 
+@dataclass(slots=True, eq=False)
+class Gathering:
+    """Frames from parts whose numbers rise within a frame. begun: where the current frame begins.
+    garbage: bytes in no frame."""
+
+    profile: SkinProfile
+    numbers: list[NDArray[Any]] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+    skipped: list[int] = field(default_factory=list)
+    begun: int = 0
+    garbage: int = 0
+    size: int = 0
+    _before: int = 0  # garbage since the last frame
+    _held: int = 0  # bytes of the parts of the current frame
+    _parts: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
+
+    @property
+    def open(self) -> bool:
+        """Whether parts of an unfinished frame are held."""
+        return bool(self._parts)
+
+    def waste(self, upto: int) -> None:
+        """The bytes up to `upto` are in no frame."""
+        self.garbage += upto - self.begun
+        self._before += upto - self.begun
+        self.begun, self._held, self._parts = upto, 0, []
+
+    def passed_over(self, begin: int, end: int) -> None:
+        """Bytes that are neither a part nor garbage."""
+        if self._parts:
+            self._held += end - begin
+        else:
+            self.begun = end
+
+    def put(self, begin: int, end: int, index: int, numbers: NDArray[Any]) -> None:
+        """A part from `begin` to `end`. A frame ends when numbers begin again."""
+        if not self._parts or index <= self._parts[-1][0]:
+            self.waste(begin)
+        self._parts.append((index, numbers))
+        self._held += end - begin
+        missing = self.profile.numbers - sum(len(part) for _, part in self._parts)
+        if missing < 0 or (missing == 0 and not self._rises()):
+            self.waste(end)
+        elif missing == 0:
+            between = end - self.begun - self._held
+            self.garbage += between
+            self.numbers.append(np.concatenate([part for _, part in self._parts]))
+            self.ends.append(end)
+            self.skipped.append(self._before + between)
+            self.size, self.begun = end - self.begun, end
+            self._before, self._held, self._parts = 0, 0, []
+
+    def _rises(self) -> bool:
+        """Whether no part is missing: indices count parts, numbers or bytes."""
+        steps = np.diff([index for index, _ in self._parts])
+        lengths = np.array([len(part) for _, part in self._parts[:-1]])
+        each = steps // lengths
+        whole = (steps == each * lengths).all() and (each == each[:1]).all()
+        return bool(whole or (steps == steps[:1]).all())
+
+    def decoded(self, data: bytes, misfit: str = "") -> Decoded:
+        """What `data` holds; the rest begins with the current frame."""
+        left = Rest(data[self.begun :])
+        return collected(
+            *(self.profile, self.numbers, self.ends, self.skipped, self.garbage, left, self.size),
+            misfit=misfit,
+        )
+
+
 def collected(
     profile: SkinProfile,
     numbers: list[NDArray[Any]],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, collected
+from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Gathering, Rest, collected
 from palpate.io.skin_profile import SkinProfile
 
 SEPARATORS, BRACKETS = b",;\t\r ", b"[](){}"
@@ -51,7 +51,9 @@ _SHOWN = 40
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Numbers between separators, brackets, and the text that the profile names. A line is a frame,
-    or a row of a frame that a shorter line ends."""
+    or a row of a frame that a shorter line ends; with an index, a part with its number."""
+    if profile.index:
+        return _indexed(profile, rest.data + new)
     data, mark, prefix = rest.data + new, profile.line_end.encode(), profile.prefix.encode()
     per_line = profile.cols * profile.values * (profile.rows if profile.lines == "frames" else 1)
     lines = 1 if profile.lines == "frames" else profile.rows
@@ -87,6 +89,38 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         garbage, begun = garbage + len(data) - begun, len(data)
     left = Rest(data[begun:])
     return collected(profile, numbers, ends, skipped, garbage, left, size, misfit=misfit)
+
+
+def _indexed(profile: SkinProfile, data: bytes) -> Decoded:
+    """The frames of lines that hold their numbers; other lines are passed over."""
+    frames, begins, at, misfit = Gathering(profile), beginning(profile.index), 0, ""
+    per_line = profile.values * (profile.cols if profile.lines == "rows" else 1)
+    while (end := data.find(profile.line_end.encode(), at)) >= 0:
+        line, begin, at = data[at:end], at, end + 1
+        if not (match := begins.match(line)):
+            frames.passed_over(begin, at)
+            continue
+        row, why = _numbers(profile, line[match.end() :], per_line)
+        misfit = why or misfit
+        if row is None or len(row) != per_line:
+            frames.waste(at)
+            continue
+        number = int(match[1])
+        if profile.index.count("#") > 1:
+            number = number * profile.cols + int(match[2])
+        frames.put(begin, at, number, row)
+    if len(data) - at > MOST_PACKET:
+        frames.waste(len(data))
+    return frames.decoded(data, misfit)
+
+
+@lru_cache(4)
+def beginning(index: str) -> re.Pattern[bytes]:
+    """Matches the beginning of a line, with a group for each # of `index`."""
+    parts = [
+        rb"\s*".join(map(re.escape, part.encode().split())) + rb"\s*" for part in index.split("#")
+    ]
+    return re.compile(rb"\s*" + rb"([0-9]{1,6})(?![0-9.])\s*".join(parts))
 
 
 def split(line: bytes, decimal: str = ".") -> tuple[list[bytes], str]:

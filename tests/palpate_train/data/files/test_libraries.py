@@ -24,6 +24,7 @@ TIMES = np.arange(40) / 10
         ("a.parquet", "pyarrow"),
         ("a.tdms", "nptdms"),
         ("a.mcap", "rosbags.highlevel"),
+        ("a.zarr", "zarr"),
     ],
 )
 def test_a_missing_library_is_named_with_its_extra(

@@ -14,6 +14,7 @@ import numpy as np
 from palpate.core.errors import FormatError
 from palpate.core.text import printable
 from palpate_train.data.extras import library
+from palpate_train.data.files import mcap_json
 from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -51,6 +52,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     kind = path.suffix.lower()
     if not WHOLE.get(kind, lambda _: True)(path):
         raise FormatError(f"has no end, as if it was cut off; {MENDED[kind]} makes it whole")
+    if kind == ".mcap" and mcap_json.may_hold(path) and (table := mcap_json.read(path, wanted)):
+        return table
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
     with _opened(highlevel, source, store, MENDED.get(kind, "")) as bag:
         topics: dict[str, list[Any]] = {}

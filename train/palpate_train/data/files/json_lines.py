@@ -29,13 +29,13 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     else:
         rows, said = _lines(lines_of(text))
         notes, what = [*notes, *said], "line"
-    frames = [(i, dict(_flat("", value))) for i, value in rows]
+    frames = [(i, dict(flat("", value))) for i, value in rows]
     if not frames:
         raise FormatError("holds no frames; write one object or list of numbers on each line")
     while len(frames) > 2 and frames[0][1].keys() != frames[1][1].keys() == frames[2][1].keys():
         notes = [*notes, f"{what} {frames[0][0]} is passed over: it has other keys"]
         frames = frames[1:]
-    return replace(_table(frames, what, notes), facts=facts)
+    return replace(table_of(frames, what, notes), facts=facts)
 
 
 def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:
@@ -115,19 +115,22 @@ def _lines(lines: Sequence[str]) -> tuple[list[tuple[int, Any]], list[str]]:
     return rows, []
 
 
-def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+def flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """The numbers and texts in a value, with their paths: t, header.stamp, taxels.0."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from _flat(f"{name}.{key}" if name else key, inner)
+            yield from flat(f"{name}.{key}" if name else key, inner)
     elif isinstance(value, list):
         for k, inner in enumerate(value):
-            yield from _flat(f"{name}.{k}" if name else str(k), inner)
+            yield from flat(f"{name}.{k}" if name else str(k), inner)
     else:
         yield name, value
 
 
-def _table(frames: Sequence[tuple[int, dict[str, Any]]], what: str, notes: Sequence[str]) -> Table:
+def table_of(
+    frames: Sequence[tuple[int, dict[str, Any]]], what: str, notes: Sequence[str]
+) -> Table:
+    """A table of frames with their numbers. what: how a message calls one. Raises FormatError."""
     names = list(frames[0][1])
     columns: list[Array] = []
     texts: dict[int, list[str]] = {}

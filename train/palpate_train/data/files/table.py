@@ -51,7 +51,8 @@ class Table:
     arrays of frames, that were not read. texts: text
     columns, one text for each frame, by column number from 0. faults: for each other column with a
     cell that is not a number, a message about the first. notes: remarks. facts: texts about the
-    whole recording by name, such as attributes.
+    whole file by name, such as attributes. labels: texts for each frame by name. ends: the numbers
+    of frames before the ends of its recordings, () for one recording.
     reversible: whether a program may have reversed the axes, and the file does not show it.
     """
 
@@ -64,6 +65,8 @@ class Table:
     notes: tuple[str, ...] = ()
     reversible: bool = False
     facts: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    ends: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

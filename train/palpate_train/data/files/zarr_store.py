@@ -1,0 +1,94 @@
+"""Reads Zarr, versions 2 and 3, as a folder or packed as .zip. A replay buffer with `episode_ends`
+is one recording for each episode."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import FormatError
+from palpate_train.data.extras import library
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal
+
+SUFFIXES = (".zarr",)
+ROOTS = (".zgroup", ".zarray", "zarr.json")
+"""Names of the files that describe a store or an array; a store has one of them in its folder."""
+ENDS = "episode_ends"
+"""The frames before each episode's end (real-stanford/diffusion_policy, replay_buffer.py)."""
+
+
+def is_store(path: Path) -> bool:
+    """Whether a folder or a zip archive is a Zarr store."""
+    if path.suffix.lower() == ".zip" and path.is_file():
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return any(name in ROOTS for name in archive.namelist())
+        except (OSError, zipfile.BadZipFile):
+            return False
+    return any((path / name).is_file() for name in ROOTS)
+
+
+def read(path: Path, wanted: ReadPlan) -> Table:
+    """The only array of frames, or `wanted.variable`. Raises FormatError that lists the arrays."""
+    zarr = library("zarr", "a Zarr store")
+    if not is_store(path):
+        raise FormatError(f"holds none of {', '.join(ROOTS)}, as a Zarr store does; copy it again")
+    if path.is_dir():
+        return _read(zarr.open(str(path), mode="r"), wanted)
+    with closing(zarr.storage.ZipStore(path, mode="r")) as store:
+        return _read(zarr.open(store, mode="r"), wanted)
+
+
+def _read(root: Any, wanted: ReadPlan) -> Table:
+    inside = dict(root.members(max_depth=None)) if hasattr(root, "members") else {"array": root}
+    arrays = {name: one for name, one in inside.items() if hasattr(one, "shape")}
+    name = next((name for name in arrays if name.rpartition("/")[2] == ENDS), "")
+    ends = np.asarray(arrays.pop(name)[...], np.int64).tolist() if name else []
+    entries = {
+        name: Entry.of(one.shape, np.dtype(one.dtype), partial(_all, one))
+        for name, one in sorted(arrays.items())
+    }
+    table = chosen(entries, wanted)
+    count = len(table.values)
+    if ends and (ends != sorted(ends) or ends[-1] != count):
+        raise FormatError(
+            f"{name} ends at {ends[-1]}, but there are {count} frames; name their array with"
+            " --variable"
+        )
+    groups = (root, *(one for one in inside.values() if not hasattr(one, "shape")))
+    said = {k: v for group in groups for k, v in dict(group.attrs).items()}
+    facts = {normal(k): str(v) for k, v in said.items() if isinstance(v, str | int | float)}
+    labels = _labels(arrays, wanted, ends, count)
+    return replace(table, ends=tuple(ends), labels=labels, facts=facts)
+
+
+def _labels(
+    arrays: Mapping[str, Any], wanted: ReadPlan, ends: list[int], count: int
+) -> dict[str, list[str]]:
+    """What --field asks for of arrays with a text or a number for each frame or each episode."""
+    found: dict[str, list[str]] = {}
+    for field in wanted.fields:
+        names = [name for name in arrays if field in (normal(name), name.rpartition("/")[2])]
+        values = [
+            _all(arrays[name]).ravel() for name in names if arrays[name].size in (count, len(ends))
+        ]
+        if len(values) == 1 and len(names) == 1:
+            texts = [
+                t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t)
+                for t in values[0].tolist()
+            ]
+            of_episodes = len(texts) == len(ends) and len(texts) != count
+            repeats = np.diff([0, *ends]).tolist() if of_episodes else [1] * count
+            found[field] = [text for text, n in zip(texts, repeats, strict=True) for _ in range(n)]
+    return found
+
+
+def _all(array: Any) -> Array:
+    return np.asarray(array[...])
