@@ -99,7 +99,7 @@ def _plain(page: str) -> str:
     text = re.sub(r"(?s)<!-- as text:\n\n(.*?)\n*-->", r"\1", page)
     text = re.sub(r"(?s)<!--.*?-->\n?", "", text)
     text = re.sub(r"(?m)^!\[[^\]]*\]\([^)]*\)\n\n?", "", text)
-    text = re.sub(r"\[([^\]]+)\]\(([^)#]+)[^)]*\)", _reference, text)
+    text = re.sub(r"\[([^\]]+)\]\(([^)#]*)[^)]*\)", _reference, text)
     return re.sub(r"(?m)^(#{2,}) ", r"#\1 ", text)
 
 
