@@ -1,4 +1,4 @@
-"""The commands `sets`, `sets describe`, `sets view`, `sets lerobot` and `pull`."""
+"""The commands `sets`, `sets describe`, `sets view`, `sets lerobot`, `sets mcap` and `pull`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from palpate.core.storage import put
 from palpate.core.text import say
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
-from palpate_train.data import extras, lerobot_writer, pull, sets, summary
+from palpate_train.data import extras, lerobot_writer, mcap_writer, pull, sets, summary
 from palpate_train.evaluate import set_warnings
 
 
@@ -51,6 +51,10 @@ def _add_sets(add: Add) -> None:
     robot.add_argument("set", metavar="SET", help=options.SET)
     robot.add_argument("out", type=Path, metavar="OUT", help="its folder, which is made")
     robot.set_defaults(run=run_lerobot)
+    shown = commands.add_parser("mcap", help="write sweeps as MCAP, which Foxglove draws")
+    shown.add_argument("set", metavar="SET", help=f"{options.SET}; of a folder, verdicts too")
+    shown.add_argument("out", type=Path, metavar="OUT", help="the new file, such as mine.mcap")
+    shown.set_defaults(run=run_mcap)
 
 
 def _add_pull(add: Add) -> None:
@@ -129,6 +133,13 @@ def run_lerobot(args: argparse.Namespace) -> None:
     lerobot_writer.write(sweeps, args.out)
     frames = len(sweeps) * sweeps.format.window
     say(f"{args.out}: {len(sweeps)} episodes of {len(sweeps.materials)} tasks, {frames} frames")
+
+
+def run_mcap(args: argparse.Namespace) -> None:
+    """Write the sweeps and print how many there are."""
+    options.writable_file(args.out)
+    sweeps, frames = mcap_writer.write(args.set, args.out)
+    say(f"{args.out}: {sweeps} sweeps, {frames} frames")
 
 
 def run_pull(args: argparse.Namespace) -> None:
