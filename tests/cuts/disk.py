@@ -28,6 +28,10 @@ from tests.cuts.tree import NOTHING, Tree, digest
 
 HOWS = ("all", "synced", "none", "half", "zeros")
 """What may be left of the content of a file that is not synced."""
+IN_PLACE = re.compile(r"\.db(-wal|-journal)?$")
+"""Files of SQLite, which changes parts of them: synced bytes in other sectors do not vanish. Of the
+changed sectors the first half may be there, or zeros."""
+SECTOR = 4096
 MOST_STATES = 4096
 """Largest number of states of the names at one moment; a program with more should have synced
 earlier."""
@@ -256,7 +260,12 @@ class Disk:
             for one in unsure if len(unsure) > 1 else ():
                 ways += [ways[0] | {id(one): "synced"}, ways[1] | {id(one): "all"}]
             for way in ways if unsure else [{}]:
-                found = {path: _held(inode, way.get(id(inode), "all")) for path, inode in there}
+                found = {
+                    path: _held(
+                        inode, way.get(id(inode), "all"), in_place=bool(IN_PLACE.search(path))
+                    )
+                    for path, inode in there
+                }
                 if (name := digest(found, self._apart)) not in reported:
                     reported.add(name)
                     yield found
@@ -311,12 +320,31 @@ def _walk(
                 yield from _walk(inode, over, f"{at}{name}/")
 
 
-def _held(inode: Inode, how: str) -> bytes | str | None:
+def _held(inode: Inode, how: str, *, in_place: bool = False) -> bytes | str | None:
     match inode:
         case Folder():
             return None
         case Link():
             return inode.target
     data = inode.data
+    if in_place:
+        return _torn(data, inode.synced, how)
     held = (data, inode.synced, b"", data[: len(data) // 2], bytes(len(data)))
     return held[HOWS.index(how)]
+
+
+def _torn(data: bytes, synced: bytes, how: str) -> bytes:
+    """The content of a file that is changed in place."""
+    sectors = range(0, max(len(data), len(synced)), SECTOR)
+    changed = [at for at in sectors if data[at : at + SECTOR] != synced[at : at + SECTOR]]
+    if how == "all" or not changed:
+        return data
+    if how == "half":
+        middle = changed[len(changed) // 2]
+        return data[:middle] + synced[middle:]
+    if how == "zeros":
+        zeros = bytearray(data)
+        for at in changed:
+            zeros[at : at + SECTOR] = bytes(len(zeros[at : at + SECTOR]))
+        return bytes(zeros)
+    return synced

@@ -94,7 +94,10 @@ class VerdictFile:
 
     def _open(self) -> sqlite3.Connection:
         """Raises sqlite3.DatabaseError."""
-        db = sqlite3.connect(self._path, timeout=WAIT_S, check_same_thread=False)
+        # psow=0: a power cut in a write may spoil its whole sector, and with it the end of the
+        # verdict before; so SQLite fills the sector
+        url = f"{self._path.absolute().as_uri()}?psow=0"
+        db = sqlite3.connect(url, timeout=WAIT_S, uri=True, check_same_thread=False)
         try:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from palpate.bridges.memory import MemoryBridge
@@ -98,14 +100,33 @@ def test_a_damaged_file_is_moved_aside(path, caplog):
     assert "damaged" in caplog.text
 
 
-def test_wrong_kinds_are_refused(path):
-    """A text or NaN for a number is refused or missing, never stored as bytes."""
+@pytest.mark.parametrize("value", ["high", np.float32(0.9), np.bool_(True), b"1"])
+def test_wrong_kinds_are_refused(path, value):
+    """A text or a number of numpy is refused, and NaN is missing: none is stored as bytes, which
+    SQLite counts as 0."""
     file = VerdictFile(path)
     with pytest.raises(sqlite3.Error):
-        file.add(NOW, verdict(1) | {"probability": "high"})
+        file.add(NOW, verdict(1) | {"probability": value})
     file.add(NOW, verdict(2) | {"probability": math.nan})
     assert [row["probability"] for row in since(path, 0)] == [None]
     file.close()
+
+
+def test_a_copy_during_writing(path, tmp_path):
+    """With its -wal the copy has every verdict; without it some may be missing, and the rest
+    is sound."""
+    file = VerdictFile(path)
+    for sweep in range(20):
+        file.add(NOW, verdict(sweep))
+    copies = [tmp_path / name / path.name for name in ("alone", "whole")]
+    for copy in copies:
+        copy.parent.mkdir()
+        shutil.copy(path, copy)
+    shutil.copy(f"{path}-wal", f"{copies[1]}-wal")
+    file.close()
+    VerdictFile(copies[0]).close()
+    assert [row["sweep"] for row in since(copies[1], 0)] == [*range(20)]
+    assert len([*since(copies[0], 0)]) <= 20
 
 
 def test_no_file(path, tmp_path):
