@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if not args.labels and args.web is None:
         return _in_json(args, lambda: _assess(args, settings))
-    EnrolmentKey(settings.store.enrolment_key).check(TAUGHT)
+    _check_key(settings)
     lesson = TaughtLesson(
         args.labels, args.position, args.session, args.good, args.by, _options(args)
     )
@@ -60,6 +60,15 @@ def run(args: argparse.Namespace) -> int:
     except install.TeachingFailed as e:  # the sweeps are stored; there are too few so far
         print(f"teach: {e}")
     return _use(args, settings) if args.use else 0
+
+
+def _check_key(settings: Config) -> None:
+    """Raises ConfigError before anything is recorded, if nothing could be taught. A folder of keys
+    that a person names gets a key."""
+    key = EnrolmentKey(settings.store.enrolment_key)
+    if settings.sources["store.keys"] == "--set" and key.make():
+        log.info(f"teach: {key.folder} has a new key; run with the same --set store.keys")
+    key.check(TAUGHT)
 
 
 def until_taught(args: argparse.Namespace, settings: Config) -> int:

@@ -7,9 +7,11 @@ namespaces of their own, so they are not valid for delivered bundles, nor one ki
 
 from __future__ import annotations
 
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from palpate.core import storage
 from palpate.core.errors import BundleError, ConfigError, TemporaryError
 from palpate.deployment import signature
 
@@ -18,6 +20,8 @@ NAMESPACE, TAUGHT = "palpate-enrolment", "palpate-taught"
 KEY, SIGNER = "key", "signer"
 OTHERS = 0o077
 """Permission bits that a private key must not have."""
+MADE_S = 30.0
+"""Longest wait for ssh-keygen to make a key."""
 PROBE = b"palpate: does this key sign?"
 WHAT = {NAMESPACE: "the labels were not enrolled", TAUGHT: "the bundle was not taught"}
 
@@ -27,6 +31,24 @@ class EnrolmentKey:
     """The key in `folder`, below the setting store.keys."""
 
     folder: Path
+
+    def make(self) -> bool:
+        """Make the key for a bench, as `make install` does for a box; False where there is one, or
+        its signer. Raises ConfigError if it cannot be made."""
+        key, public = self.folder / KEY, self.folder / f"{KEY}.pub"
+        try:
+            if key.exists() or (self.folder / SIGNER).exists():
+                return False
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "bench", "-f", str(key)]
+            subprocess.run(command, check=True, capture_output=True, timeout=MADE_S)
+            words = public.read_text("ascii").split()
+            allowed = f'box namespaces="{NAMESPACE},{TAUGHT}" {words[0]} {words[1]}\n'
+            storage.put(self.folder / SIGNER, allowed.encode())
+            public.unlink()
+        except (OSError, subprocess.SubprocessError) as e:
+            raise ConfigError(f"{key} cannot be made: {e}; name a folder of your own") from e
+        return True
 
     def check(self, namespace: str = NAMESPACE) -> None:
         """Raises ConfigError unless this user can sign an enrolment, or another file of the
@@ -50,7 +72,8 @@ class EnrolmentKey:
             raise ConfigError(
                 f"{path}: {e.strerror}, so nothing can be enrolled; teach as the user palpate "
                 "(sudo -u palpate palpate teach); if the key does not exist, run make install, "
-                f"which makes a key unless {SIGNER} exists"
+                f"which makes a key unless {SIGNER} exists; on a bench name a folder of your own, "
+                "where one is made: --set store.keys=DIR"
             ) from e
         again = f"remove it and {SIGNER}, run make install again, and teach again"
         if mode & OTHERS:

@@ -24,6 +24,19 @@ def key(tmp_path: Path) -> EnrolmentKey:
     return install_scripts.enrolment_key(tmp_path / "enrolment")
 
 
+def test_a_bench_gets_a_key_of_its_own(tmp_path):
+    """It signs what it admits, nobody else may read it, and a second start leaves it alone."""
+    key = EnrolmentKey(tmp_path / "bench" / "enrolment")
+    assert key.make()
+    before = (key.folder / KEY).read_bytes()
+    assert not key.make()
+    for namespace in (NAMESPACE, TAUGHT):
+        key.check(namespace)
+    assert (key.folder / KEY).read_bytes() == before
+    assert (key.folder / KEY).stat().st_mode & 0o077 == 0
+    assert sorted(os.listdir(key.folder)) == [KEY, SIGNER]
+
+
 def test_an_install_makes_a_private_key_once(key):
     """Nobody else may read the key, it signs, and its signatures are valid. Another install changes
     nothing."""

@@ -11,7 +11,7 @@ from palpate_train.reports.plot_style import GREY, SMALL
 
 PLACES = [
     (dx, dy, side)
-    for right, up in ((7, 0), (0, 10), (5, 9), (0, 20), (8, 18), (16, 26), (24, 34))
+    for right, up in ((7, 0), (0, 10), (5, 12), (0, 20), (8, 18), (16, 26), (24, 34))
     for dx, dy in dict.fromkeys(((right, up), (-right, up), (right, -up), (-right, -up)))
     for side in (("left" if dx > 0 else "right" if dx < 0 else "center"),)
 ]
@@ -20,8 +20,10 @@ FAR = 15
 """From this distance on a stroke joins name and mark."""
 SIDES = {"left": 0.0, "center": 0.5, "right": 1.0}
 """The side of a name at which its mark is."""
-LETTER = 0.6
+LETTER = 0.55
 """Width of a letter, as a share of its size."""
+GAP = 3.0
+"""Least distance from a name to the next on its line, and to a mark, in units."""
 MARK = 4.0
 """Half the width of a mark, in units."""
 LEADER: dict[str, Any] = {"arrowstyle": "-", "color": GREY, "linewidth": 0.6, "shrinkB": MARK}
@@ -46,12 +48,14 @@ def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, floa
         for dx, dy, side in PLACES if text and text not in written else ():
             start = at[i][0] + dx - SIDES[side] * width
             middle = at[i][1] + dy
-            box = (start, middle - 0.5 * SMALL, start + width, middle + 0.5 * SMALL)
+            box = (start - GAP, middle - 0.5 * SMALL, start + width + GAP, middle + 0.5 * SMALL)
             inside = (
                 box[0] >= left and box[2] <= right + 6 and box[1] >= bottom and box[3] <= top + 6
             )
-            if inside and not any(_meet(box, other) for k, other in enumerate(boxes) if k != i):
-                boxes.append(box)
+            parts = [box, *(_stroke(at[i], (at[i][0] + dx, middle)) if abs(dy) > FAR else ())]
+            others = [other for k, other in enumerate(boxes) if k != i]
+            if inside and not any(_meet(part, other) for part in parts for other in others):
+                boxes += parts
                 written.add(text)
                 axes.annotate(
                     text,
@@ -68,6 +72,13 @@ def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, floa
                     arrowprops=LEADER | {"relpos": (SIDES[side], 0.5)} if abs(dy) > FAR else None,
                 )
                 break
+
+
+def _stroke(begin: Sequence[float], end: Sequence[float]) -> list[Box]:
+    """Boxes along the stroke from a mark to its name."""
+    (x, y), (to_x, to_y) = begin, end
+    along = [(x + t * (to_x - x), y + t * (to_y - y)) for t in (0.3, 0.45, 0.6, 0.75, 0.9)]
+    return [(px - 1, py - 1, px + 1, py + 1) for px, py in along]
 
 
 def _meet(a: Box, b: Box) -> bool:
