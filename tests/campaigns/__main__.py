@@ -43,6 +43,12 @@ def containers() -> None:
         install_debian(["systemd-container", "mmdebstrap"])
 
 
+def npm() -> None:
+    """Install npm, which brings old browsers."""
+    if not (shutil.which("npm") and shutil.which("node")):
+        install_debian(["npm"])
+
+
 def fuzzer() -> None:
     """Install Atheris, the fuzzer, into this virtual environment."""
     if importlib.util.find_spec("atheris") is None:
@@ -120,6 +126,11 @@ CAMPAIGNS = {
     "pictures": _module(
         "draw the pictures of README: the page of a box at work, and the demo in a terminal",
         "tests.campaigns.pictures",
+    ),
+    "old-browsers": _module(
+        "open all pages in Chromium 72, 83, 88 and 92, which npm brings (0.6 GB)",
+        "tests.campaigns.old_browsers",
+        prepare=npm,
     ),
     "rig": _module(
         "show the virtual box at work: an arm64 Debian with skin and robot, in an emulator",

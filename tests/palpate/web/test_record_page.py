@@ -443,10 +443,15 @@ def test_a_browser_that_is_too_old_says_so(browser: Any, recorded: RecordedPage)
     context.close()
 
 
-def test_finish_ends_the_page_in_words(browser: Any, tmp_path: Path):
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_finish_ends_the_page_in_words(
+    browser: Any, tmp_path: Path, width: int, height: int, scheme: str
+):
     """Done, with the way to the other page, and no red bar when the program has gone."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=True) as one:
-        context = browser.new_context()
+        size = {"width": width, "height": height}
+        context = browser.new_context(viewport=size, color_scheme=scheme)
         seen = BrowsedPage(context, one.page.server.address)
         trying = {"model": "mine 1", "labels": ["metal"], "displays": {}, "taught": "here"}
         one.more = {"trying": trying}
@@ -457,6 +462,8 @@ def test_finish_ends_the_page_in_words(browser: Any, tmp_path: Path):
     seen.page.wait_for_timeout(1500)
     assert not seen.page.is_visible("#banner")
     assert seen.text("#count").startswith("The box works")
+    assert seen.legibility()[1] == []
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     context.close()
 
 
