@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -74,7 +74,7 @@ def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, floa
                 break
 
 
-def _stroke(begin: Sequence[float], end: Sequence[float]) -> list[Box]:
+def _stroke(begin: Iterable[float], end: Iterable[float]) -> list[Box]:
     """Boxes along the stroke from a mark to its name."""
     (x, y), (to_x, to_y) = begin, end
     along = [(x + t * (to_x - x), y + t * (to_y - y)) for t in (0.3, 0.45, 0.6, 0.75, 0.9)]
