@@ -286,7 +286,11 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     if time_column is not None:
         _check_own_times(values, table, time_column, numbers)
     if len(numbers) != want:
-        raise FormatError(_mismatch(len(numbers), len(values), plan, time_column))
+        why = _mismatch(len(numbers), len(values), plan, time_column)
+        if table.texts and not plan.columns:
+            at, texts = next(iter(table.texts.items()))
+            why += f"; column {at + 1} is text, such as {texts[0]!r}"
+        raise FormatError(why)
     return values[:, numbers].reshape(len(values), *shape)
 
 

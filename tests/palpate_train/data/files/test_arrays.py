@@ -140,7 +140,7 @@ def test_json_is_read(tmp_path: Path, content: bytes):
 
 
 def test_acquired_data_is_read(tmp_path: Path):
-    """Edge Impulse's format: sensors by name, the rate in a remark; a short frame is named."""
+    """Edge Impulse's format: sensors by name, times by its interval; a short frame is named."""
     sensors = [{"name": name, "units": "N"} for name in "abcd"]
     payload = {"interval_ms": 10, "sensors": sensors, "values": SKIN.tolist()}
     (tmp_path / "a.json").write_text(json.dumps({"signature": "0", "payload": payload}))
@@ -148,6 +148,7 @@ def test_acquired_data_is_read(tmp_path: Path):
     np.testing.assert_array_equal(found.values, SKIN)
     assert found.columns == tuple("abcd")
     assert "100 Hz" in found.notes[0]
+    np.testing.assert_allclose(found.vectors["time"], np.arange(len(SKIN)) / 100)
     payload["values"][4] = [1, 2]
     (tmp_path / "a.json").write_text(json.dumps({"payload": payload}))
     with pytest.raises(FormatError, match="entry 5"):

@@ -13,14 +13,17 @@ from palpate.core.errors import FormatError
 from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, from_columns, normal
 from palpate_train.data.files.text import decoded, lines_of
 
+TIME = "time"
+"""The vector of the times that a file states by their interval, in s."""
 SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 
 
 def read(data: bytes, wanted: ReadPlan) -> Table:
     """The frames in a text of JSON. Raises FormatError that names the line and the key."""
     text, notes = decoded(data)
-    whole, facts = _whole(text), dict[str, str]()
+    whole, facts, step_s = _whole(text), dict[str, str](), None
     if isinstance(whole, dict):
+        step_s = _interval_s(whole.get("payload"))
         facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
         whole, said = _unwrapped(whole, wanted)
         notes += said
@@ -35,7 +38,10 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     while len(frames) > 2 and frames[0][1].keys() != frames[1][1].keys() == frames[2][1].keys():
         notes = [*notes, f"{what} {frames[0][0]} is passed over: it has other keys"]
         frames = frames[1:]
-    return replace(table_of(frames, what, notes), facts=facts)
+    made = replace(table_of(frames, what, notes), facts=facts)
+    if step_s is None:
+        return made
+    return replace(made, vectors={TIME: step_s * np.arange(len(made.values))}, beside=(TIME,))
 
 
 def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:
@@ -76,6 +82,13 @@ def _acquired(payload: dict[str, Any]) -> tuple[Any, list[str]]:
         )
     rate_hz = 1e3 / float(payload["interval_ms"])
     return [dict(zip(names, row, strict=True)) for row in rows], [f"it was sent at {rate_hz:g} Hz"]
+
+
+def _interval_s(payload: Any) -> float | None:
+    """The time between two frames that Edge Impulse's format states."""
+    if not isinstance(payload, dict) or "values" not in payload:
+        return None
+    return float(payload["interval_ms"]) / 1e3
 
 
 def _is_numbered(column: dict[str, Any]) -> bool:
