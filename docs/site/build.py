@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,7 @@ def main() -> int:
 def gather(out: Path) -> list[str]:
     """Write the sources of all pages into `out`; links that lead nowhere."""
     made = {"training-commands": training_commands(), "library": library()}
-    known = manual.references() | made
+    known = manual.references() | made | tables()
     lost: list[str] = []
     names = sorted(pages())
     listed = names + [RESULTS] * (out / RESULTS).exists()
@@ -105,6 +106,21 @@ def gather(out: Path) -> list[str]:
         text = linked(Path(name), text, out, lost)
         target.write_text(text + contents(listed) * (name == "README.md"), "utf-8")
     return lost
+
+
+def tables() -> dict[str, str]:
+    """Tables of files below docs/data, by their markers."""
+    held: dict[str, dict[str, Any]] = {}
+    for name in ("known-libraries", "processors"):
+        found = tomllib.loads((ROOT / "docs" / "data" / f"{name}.toml").read_text("utf-8"))
+        held |= {name: found} if "rows" in found else found
+    return {name: table(**one) for name, one in held.items()}
+
+
+def table(columns: list[str], rows: list[list[str]]) -> str:
+    """A table in Markdown."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def results(out: Path) -> None:

@@ -101,8 +101,12 @@ class SpeakingBox:
             self._ends = ()
 
     def say(self, *lines: bytes) -> None:
+        """Send lines, in pieces if the terminal is full; the rest is lost if nobody reads for 5 s."""
+        rest = b"".join(lines)
         with self._lock:
-            os.write(self._ends[0], b"".join(lines))
+            while rest and select.select([], [self._ends[0]], [], 5)[1]:
+                with contextlib.suppress(BlockingIOError):
+                    rest = rest[os.write(self._ends[0], rest) :]
 
     def wait_for(self, kind: str, timeout_s: float = 30) -> None:
         """Wait until a command has arrived."""

@@ -301,6 +301,15 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking, box):
     assert box.missed == 2
 
 
+def test_more_than_a_pseudo_terminal_holds_arrives_whole(speaking, box):
+    """Simulators speak over one: it holds some 17 kB, and a read gives 4,095 bytes at most, so
+    sentences are cut anywhere."""
+    told = state() * (40_000 // len(state()))
+    speaking.say(result(1), told, result(2), told, result(3))
+    assert [box.result(LONG_S).sweep for _ in range(3)] == [1, 2, 3]
+    assert (box.damaged, box.missed) == (0, 0)
+
+
 def test_commands_of_several_threads_do_not_mix(speaking, box):
     """Two threads that ask get each its own answers."""
     names: list[str] = []
