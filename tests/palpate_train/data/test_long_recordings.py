@@ -14,6 +14,7 @@ from palpate.answer.window import Window
 from palpate.core.types import SweepFormat
 from palpate_train.data.augment import texture_scale
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
+from palpate_train.data.junk import Slides
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import log_powers
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred, run
@@ -25,6 +26,7 @@ WINDOW = 8_800
 SWEEPS = Dataset(COUNTS[: 4 * WINDOW].reshape(4, WINDOW, 2, 2), np.arange(4) % 2, ("a", "b"), 750.0)
 LEFT = SWEEPS.without_means().samples.astype(np.float64)
 OFFSET = np.float32(50_000)
+SLIDES = Slides(COUNTS[None], COUNTS[None], np.zeros((2, 2)), 750.0, np.random.default_rng(0))
 
 
 def graph_means() -> np.ndarray:
@@ -48,6 +50,8 @@ CASES: dict[str, tuple[Callable[[], Any], Any, float]] = {
     "scale": (lambda: texture_scale(SWEEPS.samples), 1 / LEFT.std(), 1e-4),
     "deviation": (lambda: EvaluationSweeps.of(SWEEPS).rms, LEFT.std(), 1e-4),
     "powers": (lambda: log_powers(SWEEPS.samples), log_powers(SWEEPS.samples - OFFSET), 1e-6),
+    "junk's load": (lambda: SLIDES.load[0, 0], EXACT.mean(axis=0), 4e-3),
+    "junk's noise": (lambda: SLIDES.deviation[0, 0], EXACT.std(axis=0), 1e-4),
     "graph": (graph_means, 0, 0.5),
 }
 """What is computed, the value, and its largest error in counts."""

@@ -47,8 +47,8 @@ class Slides:
     @property
     def load(self) -> Array:
         """Mean counts of each window, [n, 1, ...]."""
-        load: Array = self.x.mean(axis=1, keepdims=True)
-        return load
+        load: Array = self.x.mean(axis=1, keepdims=True, dtype=np.float64)
+        return load.astype(np.float32)
 
     @property
     def rest(self) -> Array:
@@ -76,8 +76,8 @@ class Slides:
     @property
     def deviation(self) -> Array:
         """Of each taxel in each window, [n, 1, ...]."""
-        deviation: Array = self.x.std(axis=1, keepdims=True)
-        return deviation
+        deviation: Array = self.x.std(axis=1, keepdims=True, dtype=np.float64)
+        return deviation.astype(np.float32)
 
 
 def _confused(of: Slides) -> Array:
