@@ -101,7 +101,7 @@ class SpeakingBox:
             self._ends = ()
 
     def say(self, *lines: bytes) -> None:
-        """Send lines, in pieces if the terminal is full; the rest is lost if nobody reads for 5 s."""
+        """Send lines, in pieces if the terminal is full; what nobody reads for 5 s is lost."""
         rest = b"".join(lines)
         with self._lock:
             while rest and select.select([], [self._ends[0]], [], 5)[1]:
