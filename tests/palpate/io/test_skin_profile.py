@@ -42,6 +42,7 @@ def written(tmp_path: Path, text: str) -> Path:
         (GOOD + 'byte_order = "middle"', 'one of "little", "big"'),
         (GOOD + 'trailer = "0g"', "bytes in hexadecimal"),
         (GOOD + f'trailer = "{"00" * 17}"', "up to 16 bytes"),
+        (GOOD + 'checksum = "crc9"', "parameters"),
         (GOOD + 'usb_ids = ["1a86-7523"]', 'USB ids such as ["1a86:7523"]'),
         (GOOD + 'usb_ids = "1a86:7523"', "USB ids such as"),
         (GOOD + "take = [1]", "take = [1] is not 1 to 8 different ones of 0 to 0"),
