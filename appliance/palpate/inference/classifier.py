@@ -152,7 +152,7 @@ class Classifier(Observer):
         if rule and rule.farthest_mm:
             stages.append(WithinReach(rule.farthest_mm))
         if m.sliding and m.sliding.pattern and self._slide and self._slide.able:
-            stages.append(ShowsPattern(m.sliding.pattern))
+            stages.append(ShowsPattern(m.sliding.pattern, self._slide))
         if m.sliding:
             stages.append(Vibrates(m.sliding, m.labels, m.format.window, enrolled, m.disturbances))
         least = self.min_probability

@@ -16,6 +16,7 @@ from palpate.answer.slide import NO_PATTERN
 from palpate.answer.vibration import SlideLimits
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
+from palpate.bundle.manifest import Manifest
 from palpate.core.types import Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
@@ -119,6 +120,12 @@ def any_material(made: Bundle, pattern: float | None) -> Classifier:
     return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
 
 
+def sure(made: Bundle) -> Manifest:
+    """The manifest of a bundle that answers early whatever the material is."""
+    m = made.manifest
+    return replace(m, early=replace(m.early, least=(0.01,) * 9, agree=1, limits=(1e9,) * 9))
+
+
 def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
     """The slide is named. Without the limit the mixed window has a label as well. An answer without
     speeds (`slides`) is checked, too."""
@@ -132,3 +139,19 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
         verdict = box(own)
         assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
         assert verdict.detail.startswith(NO_PATTERN)
+
+
+def test_an_early_answer_needs_a_pattern_too(packaged):
+    """Four tenths of a slide are answered early. Those of a mixed window are answered only without
+    the limit."""
+    early, unlimited = (
+        EarlyExit(any_material(replace(packaged, manifest=sure(packaged)), pattern))
+        for pattern in (packaged.manifest.sliding.pattern, None)
+    )
+    for number in range(3):
+        slide, own = (
+            replace(sweep_of(one.frames.taxels[:600]), share=0.4) for one in mixed(number)
+        )
+        assert early(slide).label == unlimited(slide).label == "foam"
+        assert early(own) is None
+        assert unlimited(own).label
