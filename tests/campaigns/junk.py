@@ -25,12 +25,13 @@ from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
+from palpate_train.metrics.bundle_score import first_answer
 
 Counts = NDArray[np.float64]
 N, RATE = skin.FORMAT.window, skin.FORMAT.rate_hz
 TIMES = np.arange(N)[:, None, None]
 SECONDS = TIMES / RATE
-EACH, STEPS = 200, 10
+EACH = 200
 
 
 @dataclass(frozen=True)
@@ -342,16 +343,9 @@ def window(name: str, world: skin.World, number: int) -> tuple[NDArray[np.uint8]
 
 def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) -> Verdict:
     """The first answer to a sweep whose frames arrive in tenths."""
-    n, t_ns = len(taxels), (np.arange(N) * skin.FORMAT.period_ns).astype(np.int64)
-    frames = Frames(t_ns, np.arange(n), taxels)
-    whole = Sweep(1, 0, int(t_ns[-1]), Status.OK, frames)
-    for step in range(1, STEPS if early else 1):
-        seen = slice(0, step * n // STEPS)
-        part = Frames(t_ns[seen], frames.seq[seen], taxels[seen])
-        sweep = replace(whole, frames=part, share=step / STEPS)
-        if early and (verdict := early(sweep)):
-            return verdict
-    return box(whole)
+    t_ns = (np.arange(N) * skin.FORMAT.period_ns).astype(np.int64)
+    whole = Sweep(1, 0, int(t_ns[-1]), Status.OK, Frames(t_ns, np.arange(N), taxels))
+    return (early and first_answer(early, whole)) or box(whole)
 
 
 def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dict[str, Any]]:

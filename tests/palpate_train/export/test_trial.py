@@ -11,7 +11,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import Classifier
-from palpate_train.answer import rules
+from palpate_train.answer import fit_early, rules
 from palpate_train.answer.rules import ALL, RULES, Asked
 from palpate_train.cli.main import main
 from palpate_train.data import junk, sets
@@ -145,3 +145,17 @@ def test_score_shows_the_difference(capsys: pytest.CaptureFixture[str], tmp_path
     said = capsys.readouterr().out.splitlines()[-1]
     assert "without slide, vibration" in said
     assert said.count("classified correctly") == 2
+
+
+def test_early_answers_are_measured_as_the_box_gives_them():
+    """Slides need part of the window. A bundle that is never sure needs all of it, and its junk
+    gets the labels of whole sweeps; the card says so."""
+    made, held_out = bundle.load(bundle.DEFAULT), sets.load(SWEEPS)
+    m = made.manifest
+    assert m.early
+    never = replace(made, manifest=replace(m, early=replace(m.early, least=(1.1,) * 9)))
+    early, late = (trial.early_answers(of, held_out, 0, 2) for of in (made, never))
+    assert 0.2 <= early["share"] < late["share"] == 1
+    assert early["junk"][1] == late["junk"][1] == 2 * (len(junk.JUNK) - len(junk.SLIDES_FIRST))
+    text = fit_early.text(replace(m, figures={fit_early.FIGURES: early}))
+    assert f"{early['share']:.0%}" in text

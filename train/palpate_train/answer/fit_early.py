@@ -25,6 +25,8 @@ from palpate_train.metrics.temperature import sufficient_temperature
 from palpate_train.onnx_tools.graph_builder import run_output
 
 Array = NDArray[Any]
+FIGURES = "early answers"
+"""Key of the figures in a manifest."""
 STEPS = "early_embedding"
 """Output of a bundle's graph with the embeddings of unfinished sweeps."""
 LEVELS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.97, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
@@ -241,12 +243,20 @@ def measure(
 
 
 def text(manifest: Manifest) -> str:
-    """Whether early answers need a known material, in words; "" without early answers."""
+    """What early answers need and cost, in words; "" without early answers."""
     if manifest.early is None:
         return ""
     if not manifest.early.limits:
         return "early answers: unknown materials are not detected before the end of a sweep"
-    return f"early answers: only of known materials, at each of {len(manifest.early.limits)} steps"
+    steps = f"early answers: only of known materials, at each of {len(manifest.early.limits)} steps"
+    if not (found := manifest.figures.get(FIGURES)):
+        return steps
+    named, junk = found["junk"]
+    return (
+        f"{steps}; held-out sweeps need {found['share']:.0%} of the window, "
+        f"{manifest.made['early']['lost']:.1%} of them lose the right label, and {named} of {junk} "
+        "windows without a slide over one material get one"
+    )
 
 
 def without(bundle: Bundle) -> Bundle:

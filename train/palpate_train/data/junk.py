@@ -110,6 +110,9 @@ JUNK: dict[str, Callable[[Slides], Array]] = {
 }
 """How to make windows of each kind, before they are rounded."""
 
+SLIDES_FIRST = ("stops halfway", "lifted halfway", "two materials joined")
+"""Kinds that begin as slides over one material: until then its label is right."""
+
 
 def windows(kind: str, sweeps: Dataset, each: int, tare: Array, seed: int) -> Array:
     """Raw counts of at most `each` windows of a kind, in the type of `sweeps`."""

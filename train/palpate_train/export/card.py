@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle.manifest import Manifest
-from palpate_train.answer import altered_sweeps, fit_taxels, rules, stranger_limits
+from palpate_train.answer import altered_sweeps, fit_early, fit_taxels, rules, stranger_limits
 from palpate_train.data.sets import Dataset, digest
 
 NAME = "card.md"
@@ -94,6 +94,8 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
     lines += ["## What breaks it", "", fit_taxels.text(manifest), ""]
     if judged := rules.text(manifest):
         lines += [judged, ""]
+    if early := fit_early.text(manifest):
+        lines += [f"{early}.", ""]
     if manifest.known:
         for limit in stranger_limits.COSTS:
             if cost := stranger_limits.lines(manifest.figures, limit):

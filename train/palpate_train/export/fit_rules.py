@@ -56,7 +56,6 @@ def from_features(
     if not (fit.contacts and fit.contacts.positions(pitch_mm)):
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule
-    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     figures = fit.held_out_figures()
     prefixes = fit.trunk(prefixes=True) if rule.early else None
     given = fit.given or calibration_inputs(fit)
@@ -64,6 +63,7 @@ def from_features(
     found = _widened(fit, apart.embedding, calibration.embedding)
     classes = [apart.classes(), calibration.classes()]
     beyond = _limits(found, given, calibration.embedding, fit)
+    early = {"lost": rule.lost, "n": rule.n} if rule.early else rule.why
     content = replace(content, known=beyond.known(calibration.class_mean_temperature))
     figures |= {stranger_limits.FIGURES: beyond.figures}
     if found:
@@ -185,6 +185,10 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
     for name in left_out:
         packed = RULES[name].without(packed)
     figures = {rules.FIGURES: figures} if figures else {}
+    several = len(np.unique(content.held_out.labels)) > 1  # junk is made of two materials
+    if proven and several and packed.manifest.early:
+        found = trial.early_answers(packed, content.held_out, int(content.about.get("seed", 0)))
+        figures[fit_early.FIGURES] = found
     return replace(
         packed, manifest=replace(packed.manifest, figures=packed.manifest.figures | figures)
     )

@@ -22,12 +22,13 @@ from palpate.bundle.contents import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
 from palpate_train.answer.altered_sweeps import altered_copies
 from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.data.augment import Augmentation, augment
 from palpate_train.data.corruptions import applicable
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
-from palpate_train.data.junk import JUNK, windows
+from palpate_train.data.junk import JUNK, SLIDES_FIRST, windows
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics import bundle_score
 
@@ -137,6 +138,22 @@ def _displaced(sweeps: Dataset, tare: Array, rng: Generator) -> Dataset:
     moved = augment(loads, rows if cols > 1 else 1, MOVED, rng).swapaxes(1, 2)
     counts = digitized(moved.reshape(samples.shape) + tare, samples.dtype)
     return replace(sweeps, samples=counts)
+
+
+def early_answers(bundle: Bundle, held_out: Dataset, seed: int, each: int = EACH) -> dict[str, Any]:
+    """Figures of early answers, for fit_early.text: the mean share of the window that held-out
+    sweeps need, and the labels of junk that is no slide from the beginning."""
+    box = Classifier(bundle, SystemClock(), slides=False)
+    early = EarlyExit(box)
+    some = np.random.default_rng(seed).permutation(len(held_out))[: len(JUNK) * each]
+    answers = bundle_score.verdicts(box, held_out.take(some), early=early)
+    shares = [verdict.share for _, verdict in answers]
+    named = list[bool]()
+    for kind, junk in zip(JUNK, junk_for(held_out, bundle, seed, each), strict=True):
+        if kind not in SLIDES_FIRST:
+            answers = bundle_score.verdicts(box, junk.sweeps, early=early)
+            named += [verdict.status is Status.OK for _, verdict in answers]
+    return {"share": round(float(np.mean(shares)), 4), "junk": [sum(named), len(named)]}
 
 
 def _counted(bundle: Bundle, given: list[Given]) -> Counts:

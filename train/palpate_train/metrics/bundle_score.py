@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.metrics.answers import REFUSED, UNKNOWN, Answers
 from palpate_train.metrics.score import Score, interval, provenance
@@ -27,11 +28,16 @@ the interval."""
 
 
 def verdicts(
-    classifier: Classifier, sweeps: Dataset, *, fused: bool = False, lost: int = 0
+    classifier: Classifier,
+    sweeps: Dataset,
+    *,
+    fused: bool = False,
+    lost: int = 0,
+    early: EarlyExit | None = None,
 ) -> Iterator[tuple[int, Verdict]]:
     """The box's verdict on each sweep with the sweep's number, recording by recording. fused: the
     sweeps of a recording count as sweeps of one object. lost: frames of each sweep that never
-    arrived."""
+    arrived. early: gives the verdict as soon as it can."""
     format = sweeps.format
     t_ns, seq = (
         (np.arange(format.window) * format.period_ns).astype(np.int64),
@@ -42,7 +48,19 @@ def verdicts(
         frames = Frames(t_ns, seq, sweeps.samples[i])
         object = fused * int(recording[i] + 1)
         given = Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=object, lost=lost)
-        yield i, classifier(given)
+        yield i, (early and first_answer(early, given)) or classifier(given)
+
+
+def first_answer(early: EarlyExit, whole: Sweep) -> Verdict | None:
+    """The early answer to a window whose frames come one after the other; None if it needs them
+    all."""
+    frames, parts = whole.frames, early.steps + 1
+    for step in range(1, parts):
+        seen = slice(-(-step * len(frames) // parts))
+        part = Frames(frames.t_ns[seen], frames.seq[seen], frames.taxels[seen])
+        if verdict := early(replace(whole, frames=part, share=step / parts)):
+            return verdict
+    return None
 
 
 def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answers:
