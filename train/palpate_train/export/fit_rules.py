@@ -168,8 +168,9 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
     """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
     that do not pay. Heads judge that have not seen the held-out sweeps."""
     left_out, figures = list(asked.left_out), dict[str, Any]()
+    seed = int(content.about.get("seed", 0))
     if proven:
-        judging, seed = packed, int(content.about.get("seed", 0))
+        judging = packed
         if content.unseen:
             files = files_of(content.unseen)
             entries = {name: bundle.file_entry(data) for name, data in files.items()}
@@ -187,8 +188,7 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
     figures = {rules.FIGURES: figures} if figures else {}
     several = len(np.unique(content.held_out.labels)) > 1  # junk is made of two materials
     if proven and several and packed.manifest.early:
-        found = trial.early_answers(packed, content.held_out, int(content.about.get("seed", 0)))
-        figures[fit_early.FIGURES] = found
+        figures[fit_early.FIGURES] = trial.early_answers(packed, content.held_out, seed)
     return replace(
         packed, manifest=replace(packed.manifest, figures=packed.manifest.figures | figures)
     )
