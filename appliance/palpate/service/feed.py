@@ -3,7 +3,7 @@ that watch the box (PROTOCOL.md, part 4).
 
 Nothing here waits for a reader. The sockets are served at most every PERIOD_NS, each time a bounded
 part of them, and less often if that was costly. So all readers together take no more than SHARE of
-a core. With many or hostile readers the lines come later, but the loop does not slow down.
+a core. With hostile readers the lines come later, but the loop does not slow down.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import select
 import socket
 import stat
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -31,13 +30,6 @@ from palpate.service.feed_reader import MOST_HZ, QUEUE_BYTES, Reader, encode, sw
 from palpate.service.status_file import Report
 
 MOST_READERS = 64
-SWEEP_BYTES = 640 * 1024
-"""Longest line with a window. Lines above QUEUE_BYTES are shared by all readers, one at a time."""
-TAKE_NS = 5_000_000_000
-"""A reader that still has not taken a shared line after this time is closed when the next shared
-line comes."""
-HEAD_BYTES = 512
-"""Most bytes beside the data in a line with a window."""
 MOST_VALUES_S = 10_000
 """Most raw counts a second that are written as text; a large skin offers fewer frames a second."""
 PERIOD_NS = 30_000_000
@@ -50,8 +42,8 @@ MOST_PERIOD_NS = 250_000_000
 """Longest pause after a round, however costly it was (the machine may just have been busy)."""
 SOON_NS = 5_000_000
 """Least time between a round and the next if there is a new verdict or state to send."""
-SERVED, HEARD = 16, 2
-"""Readers that are written to, and sockets that are read, in one round."""
+HEARD = 2
+"""Sockets that are read in one round."""
 KERNEL_BYTES = 16 * 1024
 """Send buffer of a reader in the kernel, which doubles it. The default would come to 13 MB with 64
 readers."""
@@ -64,7 +56,7 @@ RETRY_NS = 5_000_000_000
 class FeedServer(Observer):
     """Offers the feed at `path` to at most MOST_READERS programs of the socket's group.
 
-    A *round* takes up connections and requests, and sends to some of the readers.
+    A *round* takes up a connection, requests of some readers, and sends to all.
 
     format: of the sweeps. facts: source, bundle, labels and skin for the first line (PROTOCOL.md).
     clock, more: as for Report. spent_ns: processor time that this thread has used so far.
@@ -86,9 +78,7 @@ class FeedServer(Observer):
         self._listener: socket.socket | None = None
         self._poll = select.epoll()
         self._readers: dict[int, Reader] = {}
-        self._due: deque[Reader] = deque()  # readers to write to, in the order of their turns
         self._newest: Frames | None = None
-        self._shared, self._shared_ns = b"", 0  # the last line above QUEUE_BYTES, and its time
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
         self._health = b""  # the line of this second
         self._tick, self._fresh = 0, False
@@ -114,17 +104,11 @@ class FeedServer(Observer):
         asked = [reader for reader in self._readers.values() if reader.sweeps]
         if not (asked and len(sweep.frames)):
             return
-        size = sweep.frames.taxels.nbytes * 4 // 3 + HEAD_BYTES
-        small, now_ns = size <= QUEUE_BYTES, self._clock.now_ns()
-        able = small or (size <= SWEEP_BYTES and self._shared_is_taken(now_ns))
-        line = sweep_line(sweep) if able else None
-        if line and not small:
-            self._shared, self._shared_ns = line, now_ns
+        # a window that no reader gets is not written as text
+        small = sweep.frames.taxels.nbytes * 4 // 3 < QUEUE_BYTES
+        line = sweep_line(sweep) if small else None
         for reader in asked:
-            if reader.connection.fileno() < 0:  # _shared_is_taken has closed it
-                continue
-            reader.put_or_miss(line)
-            self._let_wait(reader)
+            reader.put_window(line)
 
     def turn(self, health: Health) -> None:
         """Queue a new state; begin the next round when it is time."""
@@ -169,19 +153,6 @@ class FeedServer(Observer):
             with suppress(OSError):
                 self._path.unlink()
 
-    def _shared_is_taken(self, now_ns: int) -> bool:
-        """Whether all readers have taken the last shared line. A reader that had TAKE_NS for it is
-        closed."""
-        taking = [reader for reader in self._readers.values() if reader.takes(self._shared)]
-        if taking and now_ns < self._shared_ns + TAKE_NS:
-            return False
-        for reader in taking:
-            self._close(
-                reader, f"it has not taken a sweep within {TAKE_NS / 1e9:g} s; read without pause"
-            )
-        self._shared = b""
-        return True
-
     def _offer(self, now_ns: int) -> socket.socket | None:
         """The bound socket, None if it is not bound; tries again every RETRY_NS."""
         if now_ns >= self._retry_ns:
@@ -218,7 +189,6 @@ class FeedServer(Observer):
         line = encode("frame", frame)
         for reader in due:
             reader.put(line)
-            self._let_wait(reader)
 
     def _take_up(self, listener: socket.socket, health: Health) -> None:
         """Accept one connection; its first lines are `hello` and `health`."""
@@ -236,7 +206,6 @@ class FeedServer(Observer):
         self._poll.register(connection, select.EPOLLIN)
         reader.put(self._hello)
         reader.put(self._health_line(health))
-        self._let_wait(reader)
 
     def _health_line(self, health: Health) -> bytes:
         """The health line, made at most once a second: readers that connect again and again would
@@ -265,30 +234,16 @@ class FeedServer(Observer):
                 reader.sweeps = request.sweeps
 
     def _send(self) -> None:
-        """Write to the next SERVED readers. A reader that has lines left goes to the end of the
-        list."""
-        for _ in range(min(SERVED, len(self._due))):
-            reader = self._due.popleft()
-            reader.due = False
-            if reader.connection.fileno() < 0:  # closed meanwhile
-                continue
+        """Write to the readers that something waits for."""
+        for reader in [reader for reader in self._readers.values() if reader.waits]:
             try:
                 reader.send()
             except OSError:
                 self._close(reader)
-                continue
-            if reader.waits:
-                self._let_wait(reader)
 
     def _to_all(self, line: bytes) -> None:
         for reader in self._readers.values():
             reader.put(line)
-            self._let_wait(reader)
-
-    def _let_wait(self, reader: Reader) -> None:
-        if not reader.due:
-            reader.due = True
-            self._due.append(reader)
 
     def _close(self, reader: Reader, why: str = "") -> None:
         number = reader.connection.fileno()

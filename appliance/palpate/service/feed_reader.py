@@ -19,8 +19,9 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate.core.types import Sweep
 
-QUEUE_BYTES = 64 * 1024
-"""Most bytes that wait for one reader. A larger line does not count: all readers share one copy."""
+QUEUE_BYTES = 768 * 1024
+"""Most bytes that wait for one reader: a window of 640 kB as text, and other lines. Readers that
+stand still hold the same lines."""
 HEARD_BYTES = 64
 """Bytes of requests that are read at once."""
 MOST_REQUEST = 1024
@@ -102,11 +103,6 @@ def sweep_line(sweep: Sweep) -> bytes:
     return b"".join((encode("sweep", about)[:-2], b', "data": "', data, b'"}\n'))
 
 
-def _weight(line: bytes) -> int:
-    """Bytes of a reader's queue that a line takes; 0 for a line that all readers share."""
-    return len(line) if len(line) <= QUEUE_BYTES else 0
-
-
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _finite(v) for name, v in value.items()}
@@ -116,15 +112,11 @@ def _finite(value: Any) -> Any:
 
 
 class Reader:
-    """One connection with its queue of lines and its requests.
-
-    due: the reader stands in the server's list of readers to write to.
-    """
+    """One connection with its queue of lines and its requests."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
         self.frames_hz, self.sweeps = 0.0, False
-        self.due = False
         self._queue: deque[bytes] = deque()
         self._size = 0  # bytes in the queue
         self._begun = 0  # bytes of the first line that were sent
@@ -140,24 +132,19 @@ class Reader:
         """Queue a line. Where there is no room, the oldest lines are dropped, except one that was
         sent in part."""
         self._queue.append(line)
-        self._size += _weight(line)
+        self._size += len(line)
         first = 1 if self._begun else 0
         while self._size > QUEUE_BYTES and len(self._queue) > first:
-            self._size -= _weight(self._queue[first])
+            self._size -= len(self._queue[first])
             del self._queue[first]
             self._lost += 1
 
-    def put_or_miss(self, line: bytes | None) -> None:
-        """Queue a line if there is room, else count it as lost. None: a line that no reader
-        gets."""
-        if line is None or self._size + _weight(line) > QUEUE_BYTES:
+    def put_window(self, line: bytes | None) -> None:
+        """Queue a line if there is room, else count it as lost. None: it is too large for all."""
+        if line is None or self._size + len(line) > QUEUE_BYTES:
             self._lost += 1
         else:
             self.put(line)
-
-    def takes(self, line: bytes) -> bool:
-        """Whether this line is in the queue; part of it may be sent."""
-        return any(one is line for one in self._queue)
 
     def send(self) -> None:
         """Send as much as the reader takes now. Between two lines it first gets the number of
@@ -167,7 +154,8 @@ class Reader:
         """
         lost = 0 if self._begun else self._lost
         if lost:
-            self._prepend(encode("lost", {"lines": lost}))
+            self._queue.appendleft(encode("lost", {"lines": lost}))
+            self._size += len(self._queue[0])
         try:
             parts = islice(self._queue, 1, _PARTS)
             sent = self.connection.sendmsg([memoryview(self._queue[0])[self._begun :], *parts])
@@ -209,9 +197,5 @@ class Reader:
                 self.connection.send(encode("closed", {"why": why}))
         self.connection.close()
 
-    def _prepend(self, line: bytes) -> None:
-        self._queue.appendleft(line)
-        self._size += _weight(line)
-
     def _drop_first(self) -> None:
-        self._size -= _weight(self._queue.popleft())
+        self._size -= len(self._queue.popleft())

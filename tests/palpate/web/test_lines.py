@@ -114,7 +114,6 @@ def test_what_cannot_be_read_closes_the_connection(offered):
     offered.turns(2)
     (reader,) = offered.feed._readers.values()
     reader.put(encode("verdict", {"status": "fine"}))
-    offered.feed._let_wait(reader)
     offered.turns(2)
     for _ in range(4):
         watch.step()
