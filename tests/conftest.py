@@ -27,6 +27,7 @@ from palpate.core.types import Sweep
 from palpate.io.robot_link import SerialSink
 from palpate.runtime import assembly
 from palpate.sim import devices
+from palpate.sweeps.sweep_check import SweepCheck
 from palpate.tools import pseudo_terminal
 from tests.factories import browser as browsers
 from tests.factories import log_lines
@@ -116,15 +117,9 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
                     settings, model, simulated, port, stack, observers=watching, capture=capture
                 )
             else:  # a box that records
-                box = assembly.recorder(
-                    settings,
-                    simulated.format,
-                    simulated,
-                    port,
-                    stack,
-                    observers=watching,
-                    commands=commands,
-                )
+                check = SweepCheck(simulated.format, simulated.clock)
+                parts = settings, check, simulated, port, stack
+                box = assembly.assembled(*parts, observers=watching, commands=commands)
             return Rigged(box, simulated, far_end, port, kept=kept)
 
         yield make

@@ -23,6 +23,7 @@ from palpate.core.log import log
 from palpate.runtime import assembly
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_check import SweepCheck
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import OnSweep
 
@@ -64,9 +65,9 @@ def run(sync_s: float, fifo_s: float, seconds: float, folder: Path) -> SlowDiskR
         )
         stack.callback(session.close)
         note = OnSweep(lambda sweep, verdict: answers.update([str(verdict.status)]))
-        box = assembly.recorder(
+        box = assembly.assembled(
             config.load(None, site=NO_SITE),
-            skin.FORMAT,
+            SweepCheck(skin.FORMAT, simulated.clock),
             simulated,
             None,
             stack,

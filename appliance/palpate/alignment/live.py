@@ -1,25 +1,25 @@
-"""Shows the position of the contact on displays, five times a second, for `palpate skin align`."""
+"""Shows a skin on displays, five times a second, and makes the views of `palpate skin align`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.alignment.view import Display, View, figure
+from palpate.alignment.view import Display, View
 from palpate.answer.contact import IN_PLACE, ContactPositions, Point, advice, centre
 from palpate.answer.unloaded import UnloadedTracker
 from palpate.bundle.bundle import Bundle
-from palpate.core.config import Config
-from palpate.core.devices import Devices
+from palpate.core.clock import Clock
 from palpate.core.schema import typed
 from palpate.core.types import Frames, SweepFormat, normal
-from palpate.io import skins
+from palpate.io.sensor import Sensor
 
+Shown = TypeVar("Shown")
+Seen = TypeVar("Seen", covariant=True)
 VIEW_NS = 200_000_000
 """Time between two Views."""
 SPAN_S = 0.3
@@ -122,6 +122,14 @@ class ContactTracker:
         if self._expected.threshold is None:
             self._unloaded.put(taxels)
 
+    def take(self, frames: Frames) -> None:
+        """Add frames of a sensor."""
+        self.put(frames.taxels)
+
+    def look(self, sensor: Sensor) -> View:
+        """The present View of a sensor."""
+        return self.view(sensor.state, str(sensor.trouble or ""))
+
     def view(self, skin: str, trouble: str) -> View:
         """The present View. skin: its state (PROTOCOL.md). trouble: why it does not stream."""
         self._number, self._skin = self._number + 1, skin
@@ -164,11 +172,9 @@ class ContactTracker:
         least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
         if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
-            unit = self._expected.unit
-            hint = (
-                f"a taxel has not read less than {figure(least, least, unit)} "
-                f"{unit or 'raw counts'}{above} yet: something lies on the skin"
-            )
+            unit = self._expected.unit or "raw counts"
+            read = f"{least:.3g} {unit}{above}"
+            hint = f"a taxel has not read less than {read} yet: something lies on the skin"
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
             return self._view(
@@ -206,47 +212,37 @@ class ContactTracker:
         )
 
 
-class Alignment:
-    """Reads the skin and makes Views of it."""
+class Watched(Protocol[Seen]):
+    """Makes views of the frames of a sensor."""
 
-    def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
-        self._sensor = skins.sensor(settings, expected.format, devices)
-        self._tracker = ContactTracker(expected, devices.source)
-        self._enumerations = self._sensor.counters.enumerations
+    def reset(self) -> None:
+        """Start anew, as for another skin."""
 
-    def read(self) -> None:
-        """Read frames from the skin; waits at most a tenth of a second."""
-        frames = self._sensor.read()
-        if self._sensor.counters.enumerations != self._enumerations:
-            self._enumerations = self._sensor.counters.enumerations
-            self._tracker.reset()
-        self._tracker.put(frames.taxels)
+    def take(self, frames: Frames) -> None:
+        """Add frames."""
 
-    def close(self) -> None:
-        """Release the skin."""
-        self._sensor.close()
-
-    def view(self) -> View:
-        """The present View."""
-        return self._tracker.view(self._sensor.state, str(self._sensor.trouble or ""))
+    def look(self, sensor: Sensor) -> Seen:
+        """The present view."""
 
 
 def run(
-    settings: Config,
-    expected: Expected,
-    devices: Devices,
-    displays: Iterable[Display],
+    sensor: Sensor,
+    watched: Watched[Shown],
+    displays: Iterable[Display[Shown]],
+    clock: Clock,
     stopped: Callable[[], bool],
 ) -> None:
-    """Show Views on `displays` until `stopped()`. A slow display delays frames, which does no
-    harm."""
+    """Show views of a sensor on `displays` until `stopped()`. A slow display delays frames, which
+    does no harm."""
     shown_on = tuple(displays)
-    with closing(Alignment(settings, expected, devices)) as alignment:
-        next_ns = devices.clock.now_ns()
-        while not stopped():
-            alignment.read()
-            if (now := devices.clock.now_ns()) >= next_ns:
-                next_ns = now + VIEW_NS
-                view = alignment.view()
-                for display in shown_on:
-                    display.show(view)
+    enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
+    while not stopped():
+        frames = sensor.read()
+        if sensor.counters.enumerations != enumerations:
+            enumerations = sensor.counters.enumerations
+            watched.reset()
+        watched.take(frames)
+        if (now := clock.now_ns()) >= next_ns:
+            next_ns, view = now + VIEW_NS, watched.look(sensor)
+            for display in shown_on:
+                display.show(view)

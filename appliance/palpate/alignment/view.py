@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from palpate.answer.contact import ContactPositions, Point
 
@@ -58,15 +58,11 @@ class View:
         return asdict(self)
 
 
-def figure(value: float, full: float, unit: str) -> str:
-    """A load in text: raw counts as whole numbers, newtons with two digits, other units with up to
-    three digits in all. full: the strongest load on the scale."""
-    digits = 2 if unit == "N" else 0 if not unit or full >= 100 else 1 if full >= 10 else 2
-    return f"{value:.{digits}f}"
+Shown = TypeVar("Shown", contravariant=True)
 
 
-class Display(Protocol):
-    """Shows one View after another."""
+class Display(Protocol[Shown]):
+    """Shows one view after another."""
 
-    def show(self, view: View) -> None:
-        """Show `view` instead of the previous View."""
+    def show(self, view: Shown) -> None:
+        """Show `view` instead of the view before."""

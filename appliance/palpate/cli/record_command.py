@@ -29,6 +29,7 @@ from palpate.io.robot_link import Command, Port
 from palpate.runtime import assembly
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_check import SweepCheck
 
 if TYPE_CHECKING:
     from palpate.web.record import RecordPage
@@ -54,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
         pages = page(args.web, settings, format, devices, *talk)
         _announce(format, folder)
         reports = _observers(settings, format, devices.source, recording)
-        box = assembly.recorder(
-            *(settings, format, devices, port, stack),
+        check = SweepCheck(format, devices.clock)
+        box = assembly.assembled(
+            *(settings, check, devices, port, stack),
             capture=capture(args, settings, format, stack),
             observers=[disk, *reports, *pages],
             commands=recording.commands,

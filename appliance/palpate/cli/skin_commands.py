@@ -25,8 +25,6 @@ from palpate.io.usb_sensor import fits
 
 if TYPE_CHECKING:
     from palpate.alignment.live import Expected
-    from palpate.alignment.view import Display
-    from palpate.tools.skin_monitor import SkinDisplay
 
 CHECK_S = 10.0
 """Default of `palpate skin check --seconds`."""
@@ -182,6 +180,7 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 
 def run_show(args: argparse.Namespace) -> int:
     """Show the skin live, a line a second and on a page, until Ctrl-C."""
+    from palpate.alignment import live
     from palpate.alignment.lines import LinePrinter
     from palpate.tools import skin_monitor
 
@@ -195,9 +194,9 @@ def run_show(args: argparse.Namespace) -> int:
         pages = local_page("skin.html", args.web, stack)
         lines = LinePrinter(sys.stdout, devices.clock, skin_monitor.line)
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        shown_on: list[SkinDisplay] = [lines, *pages]
         names = settings.skin.profile, devices.source, skins.profile(settings).unit
-        skin_monitor.run(sensor, format, names, devices.clock, shown_on, stopped)
+        monitor = skin_monitor.SkinMonitor(format, names)
+        live.run(sensor, monitor, [lines, *pages], devices.clock, stopped)
     return stopped.exit_code
 
 
@@ -208,14 +207,17 @@ def run_align(args: argparse.Namespace) -> int:
 
     if args.sim == "skin":  # a sweep lifts the finger for a tenth of a second; here it rests
         args.sim = "rest"
-    settings = load_settings(args)
-    devices = open_any(args, settings)
-    expected = _expected(devices.wire(settings), devices)
+    given = load_settings(args)
+    devices = open_any(args, given)
+    settings = devices.wire(given)
+    expected = _expected(settings, devices)
     stopped = StopFlag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = local_page("watch.html", args.web, stack)
-        displays: list[Display] = [LinePrinter(sys.stdout, devices.clock, line), *pages]
-        live.run(devices.wire(settings), expected, devices, displays, stopped)
+        lines = LinePrinter(sys.stdout, devices.clock, line)
+        sensor = stack.enter_context(closing(skins.sensor(settings, expected.format, devices)))
+        tracker = live.ContactTracker(expected, devices.source)
+        live.run(sensor, tracker, [lines, *pages], devices.clock, stopped)
     return stopped.exit_code
 
 

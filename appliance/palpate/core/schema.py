@@ -57,8 +57,6 @@ class Key:
         """`value` as the field's type, or None if it is not allowed."""
         if "read" in self.limits:
             return self.limits["read"](value)
-        if get_origin(self.hint) is Literal:
-            return value if value in get_args(self.hint) else None
         value = _nested(self.hint, value)
         if not _fits(value, self.hint) or (type(value) is tuple and "" in value):
             return None
@@ -153,6 +151,8 @@ def _fits(value: Any, hint: Any) -> bool:
     """Whether `value` from a file is allowed for a field of type `hint`."""
     if get_origin(hint) is UnionType:
         return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
     if get_origin(hint) is tuple:
         return type(value) is tuple and all(_fits(v, get_args(hint)[0]) for v in value)
     if get_origin(hint) is dict:

@@ -33,6 +33,15 @@ _PATTERN = re.compile(
 )
 
 
+def future_of(reply: Reply) -> Future[list[object]]:
+    """The reply as a future; the fields of a command that is done are in it already."""
+    if isinstance(reply, Future):
+        return reply
+    done: Future[list[object]] = Future()
+    done.set_result(reply)
+    return done
+
+
 @dataclass(frozen=True, slots=True)
 class Sentence:
     """A line that was received. kind: RES, STA, … or the name of a command. text: the text after

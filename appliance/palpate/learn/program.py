@@ -32,6 +32,7 @@ from palpate.runtime.loop import Box
 from palpate.service.systemd import Notifier
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_check import SweepCheck
 
 NOTHING, GOOD = "nothing taught yet", 8
 """The model of a box that is being taught, in status and feed; and its wanted number of sweeps."""
@@ -161,19 +162,15 @@ class RecordingPhase(Phase):
         self._session = session = self._lesson(say)
         stack.callback(session.close)
         self._teacher = Teacher(session, () if again else lesson.labels, lesson.good)
-        base = program.base
-        self.box = assembly.recorder(
-            settings,
-            program.format,
-            devices,
-            port,
-            stack,
+        slides = slide_check(program.base.bundle) if program.base else SlidesAmong(program.format)
+        check = SweepCheck(program.format, devices.clock, slides)
+        self.box = assembly.assembled(
+            *(settings, check, devices, port, stack),
             capture=outputs.capture(stack),
             observers=[disk, *self._observers(), self._teacher, *outputs.pages],
             commands=program.by_robot({**session.recording_commands, **session.commands}),
             ordered=bool(outputs.pages or lesson.waits),
             serving=False,
-            slides=slide_check(base.bundle) if base else SlidesAmong(program.format),
         )
         self.orders = {**session.recording_commands, **session.commands, "DONE": program.finish}
         session.by = "the page" if outputs.pages else lesson.by or getpass.getuser()

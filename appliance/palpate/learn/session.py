@@ -19,7 +19,7 @@ from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.health import Health
 from palpate.core.log import log
 from palpate.core.observer import Observer
-from palpate.core.sentences import CommandHandler, Reply, sentence
+from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Sweep, Verdict
 from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
@@ -243,18 +243,13 @@ class TeachingSession(Observer):
         refuse_trained(self._trained, [renamed])
         self.admit(*filter(None, [label]), renamed=renamed)
         reply = self._recording.commands[command](text)
-        if isinstance(reply, Future):
-            reply.add_done_callback(partial(self._moved_later, what, label))
-        else:
-            self._moved(what, label)
+        future_of(reply).add_done_callback(partial(self._moved, what, label))
         return reply
 
-    def _moved_later(self, what: str, label: str, reply: Future[list[object]]) -> None:
-        if not reply.exception():
-            self._moved(what, label)
-
-    def _moved(self, what: str, label: str) -> None:
+    def _moved(self, what: str, label: str, reply: Future[list[object]]) -> None:
         """Sweeps have another material. what: the number of one, or the former name of all."""
+        if reply.exception():
+            return
         if what in self._named:
             self._named = {label if name == what else name: None for name in self._named}
         if self._learnt:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-
-from numpy.typing import NDArray
 
 from palpate.bundle import bundle as bundles
 from palpate.bundle.bundle import Bundle
@@ -40,7 +38,7 @@ from palpate.io.lineless_triggers import (
 from palpate.io.robot_link import Port, SerialSink, StdoutPort
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.io.verdict_lines import LineSink, check_bits
-from palpate.runtime.loop import Answerer, Box, Panel, Pipeline
+from palpate.runtime.loop import Box, Panel, Pipeline
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.sweep_check import SweepCheck
 from palpate.sweeps.sweep_window import SweepCutter
@@ -70,34 +68,18 @@ def box(
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
-    *,
-    capture: CaptureWriter | None = None,
-    observers: Iterable[Observer] = (),
-    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
-    ordered: bool = False,
+    **more: Any,
 ) -> Box:
-    """The box that classifies; `stack` closes it again. capture: records all inputs. commands,
-    ordered: as for `recorder`."""
+    """The box that classifies; `stack` closes it again. more: as for `assembled`."""
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
-    return _assembled(
-        devices.wire(settings),
-        run,
-        devices,
-        port,
-        stack,
-        capture,
-        [run, *observers],
-        commands,
-        codes=bundle.manifest.labels,
-        early=early_exit(settings, run),
-        ordered=ordered,
-    )
+    more |= {"codes": bundle.manifest.labels, "early": early_exit(settings, run)}
+    return assembled(settings, run, devices, port, stack, **more)
 
 
-def recorder(
+def assembled(
     settings: Config,
-    format: SweepFormat,
+    answerer: Classifier | SweepCheck,
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
@@ -105,48 +87,18 @@ def recorder(
     capture: CaptureWriter | None = None,
     observers: Iterable[Observer] = (),
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
-    ordered: bool = False,
-    serving: bool = True,
-    slides: Callable[[NDArray[Any]], str | None] | None = None,
-) -> Box:
-    """The box that records sweeps of a format and needs no bundle; the class bits stay 0. ordered:
-    commands also come from another source than the port. serving: whether READY may rise. slides:
-    as for SweepCheck. Other parameters as for `box`."""
-    check = SweepCheck(format, devices.clock, slides)
-    watching = [check, *observers]
-    return _assembled(
-        devices.wire(settings),
-        check,
-        devices,
-        port,
-        stack,
-        capture,
-        watching,
-        commands,
-        ordered=ordered,
-        serving=serving,
-    )
-
-
-def _assembled(
-    settings: Config,
-    answerer: Answerer,
-    devices: Devices,
-    port: Port | None,
-    stack: ExitStack,
-    capture: CaptureWriter | None,
-    observers: Iterable[Observer],
-    commands: Mapping[str, CommandHandler],
-    *,
     codes: tuple[str, ...] = (),
     early: EarlyExit | None = None,
     ordered: bool = False,
     serving: bool = True,
 ) -> Box:
-    """Put the components together. codes: labels that the class bits hold."""
-    commands = {**commands, "LABEL": partial(_label, codes)}
+    """The box with this answerer; `stack` closes it again. capture: records all inputs. codes:
+    labels that the class bits hold. ordered: commands also come from another source than the port.
+    serving: whether READY may rise."""
+    settings = devices.wire(settings)
     trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
-    watching = [*observers, *([capture] if capture else []), *_watches(trigger)]
+    watching = [answerer, *observers, *([capture] if capture else []), *_watches(trigger)]
+    commands = {**commands, "LABEL": partial(_label, codes)}
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)

@@ -20,7 +20,7 @@ from palpate.core.errors import ApplianceError, ModelError
 from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
-from palpate.core.sentences import CommandHandler, Reply, sentence
+from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import Command, Port
@@ -385,18 +385,14 @@ class Box:
 
     def _begun(self, command: Command) -> Future[list[object]]:
         """Carry out a command of the serial line."""
-        reply: Future[list[object]] = Future()
         try:
             if command.error:
                 raise ApplianceError(command.error)
-            fields = self.obey(command)
+            return future_of(self.obey(command))
         except Exception as e:  # also one that nobody expected: the robot waits for an answer
+            reply: Future[list[object]] = Future()
             reply.set_exception(e)
             return reply
-        if isinstance(fields, Future):
-            return fields
-        reply.set_result(fields)
-        return reply
 
     def obey(self, command: Command) -> Reply:
         """Carry out a command of any origin. To be called between two turns or in an observer's

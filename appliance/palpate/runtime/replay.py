@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,8 @@ SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
 sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
-CHOICES = {
-    name: get_args(get_type_hints(ClassifierConfig)[name])
-    for name in ("fuse", "conflict", "strangers")
-}
+RULE = ("fuse", "min_probability", "max_sweeps", "conflict", "object_s", "strangers")
+"""The settings of the classifier that a sidecar holds as `rule`."""
 
 
 class OtherBundle(FormatError):
@@ -59,29 +57,12 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
     return int(_print(path, last, out) == DIFFERENT)
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayRule:
-    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys. Raises
-    TypeError for an unknown choice."""
-
-    fuse: str
-    min_probability: float
-    max_sweeps: int
-    conflict: str
-    object_s: float
-    strangers: str
-
-    def __post_init__(self) -> None:
-        for name, known in CHOICES.items():
-            if (value := getattr(self, name)) not in known:
-                raise TypeError(f"{name} {value!r} is not one of {', '.join(known)}")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class KeptSweep:
     """A kept sweep with the content of its sidecar; without a bundle it has fewer entries.
 
-    object: the folder, run and object number that fused sweeps share. rule: None without an entry.
+    object: the folder, run and object number that fused sweeps share. rule: the settings at the
+    time of the sweep, None without an entry.
     tare: [R, C] or [R, C, A] raw counts, None without an entry. bundle: its id, or "". verdict: as
     `Verdict.as_dict` returns it, or empty. broken: taxels that were broken over the stream.
     """
@@ -89,7 +70,7 @@ class KeptSweep:
     sweep: Sweep
     format: SweepFormat
     object: tuple[Path, int, int]
-    rule: ReplayRule | None
+    rule: ClassifierConfig | None
     tare: NDArray[np.float64] | None
     bundle: str
     verdict: dict[str, Any]
@@ -103,7 +84,7 @@ class KeptSweep:
         try:
             tare = np.asarray(about["tare"], np.float64) if "tare" in about else None
             tare = None if tare is None else np.broadcast_to(tare, format.shape)
-            rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
+            rule = _rule(about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "after", "time_ns")):
@@ -114,6 +95,13 @@ class KeptSweep:
             raise FormatError(
                 f"{path}: its sidecar cannot be used: {e}; use a sweep that was not changed"
             ) from e
+
+
+def _rule(held: Any) -> ClassifierConfig:
+    """Raises TypeError for an unknown choice, or for other keys."""
+    if not isinstance(held, dict) or held.keys() != {*RULE}:
+        raise TypeError(f"rule {held!r} does not have {', '.join(RULE)}")
+    return typed(ClassifierConfig, held)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,10 +179,9 @@ class SweepReplay:
         made = kept.object[:2], kept.rule
         if self._classifier is None or made != self._made:
             self._made = made
-            if kept.rule:
-                self._classifier = Classifier(self._bundle, self._clock, *astuple(kept.rule))
-            else:
-                self._classifier = assembly.classifier(self._settings, self._bundle, self._clock)
+            rule = kept.rule or self._settings.classifier
+            settings = replace(self._settings, classifier=rule)
+            self._classifier = assembly.classifier(settings, self._bundle, self._clock)
         self._classifier.tare = self._bundle.manifest.tare if kept.tare is None else kept.tare
         self._classifier.taxels.broken = kept.broken
         self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)

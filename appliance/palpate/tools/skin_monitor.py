@@ -3,15 +3,13 @@ the format is the skin's own, and the faults are visible in the signal alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.alignment.live import VIEW_NS
-from palpate.core.clock import Clock
 from palpate.core.types import Frames, SweepFormat
 from palpate.io.sensor import Sensor
 
@@ -66,12 +64,6 @@ class LiveView:
         return asdict(self)
 
 
-class SkinDisplay(Protocol):
-    """Shows one LiveView after another."""
-
-    def show(self, view: LiveView) -> None: ...
-
-
 def line(view: LiveView) -> str:
     """A LiveView in one line: rate, frames, loss, noise and faulty taxels."""
     rate = "" if view.rate_hz is None else f"{view.rate_hz:.1f} Hz, "
@@ -91,42 +83,13 @@ def _named(taxels: Sequence[str]) -> str:
     return ", ".join(taxels[:MOST_NAMED]) + more
 
 
-def run(
-    sensor: Sensor,
-    format: SweepFormat,
-    names: tuple[str, str, str],
-    clock: Clock,
-    displays: Iterable[SkinDisplay],
-    stopped: Callable[[], bool],
-) -> None:
-    """Show the frames of `sensor` on `displays`, five times a second, until `stopped()`. names: of
-    the skin's profile, of the source in sentences, of the unit."""
-    shown_on, monitor, number = tuple(displays), SkinMonitor(format), 0
-    enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
-    name, source, unit = names
-    shape = format.rows, format.cols, format.axes
-    while not stopped():
-        frames = sensor.read()
-        if sensor.counters.enumerations != enumerations:
-            enumerations = sensor.counters.enumerations
-            monitor.reset()
-        monitor.put(frames)
-        if (now := clock.now_ns()) >= next_ns:
-            next_ns, number = now + VIEW_NS, number + 1
-            what = number, source, f"{name} {format}", sensor.state, str(sensor.trouble or "")
-            counted = sensor.counters.frames
-            lost = sensor.counters.lost_frames if sensor.loss_known else None
-            view = LiveView(
-                *what, shape, frames=counted, lost=lost, unit=unit, **monitor.measured()
-            )
-            for display in shown_on:
-                display.show(view)
-
-
 class SkinMonitor:
-    """Collects the frames of a skin. All times are times of frames, so no clock is needed."""
+    """Collects the frames of a skin. All times are times of frames, so no clock is needed. names:
+    of the skin's profile, of the source in sentences, of the unit."""
 
-    def __init__(self, format: SweepFormat) -> None:
+    def __init__(self, format: SweepFormat, names: tuple[str, str, str] = ("", "", "")) -> None:
+        name, self._source, self._unit = names
+        self._skin, self._number = f"{name} {format}", 0
         self._grid = format.rows, format.cols, format.axes
         self._limits = np.iinfo(format.dtype) if format.numpy_type.kind in "iu" else None
         self._span, self._shown = (max(2, round(s * format.rate_hz)) for s in (SPAN_S, SHOWN_S))
@@ -137,7 +100,8 @@ class SkinMonitor:
         self._lowest, self._highest = np.full(self._grid, np.inf), np.full(self._grid, -np.inf)
         self._changed_ns, self._full = np.zeros(self._grid, np.int64), 1.0
 
-    def put(self, frames: Frames) -> None:
+    def take(self, frames: Frames) -> None:
+        """Add frames."""
         if not len(frames):
             return
         new = frames.taxels.reshape(len(frames), *self._grid).astype(np.float64)
@@ -150,6 +114,18 @@ class SkinMonitor:
         self._taxels = np.concatenate([self._taxels, new])[-self._span :]
         self._lowest = np.fmin(self._lowest, new.min(axis=0))
         self._highest = np.fmax(self._highest, new.max(axis=0))
+
+    def look(self, sensor: Sensor) -> LiveView:
+        """The present state of a skin."""
+        self._number += 1
+        return LiveView(
+            *(self._number, self._source, self._skin, sensor.state, str(sensor.trouble or "")),
+            self._grid,
+            frames=sensor.counters.frames,
+            lost=sensor.counters.lost_frames if sensor.loss_known else None,
+            unit=self._unit,
+            **self.measured(),
+        )
 
     def measured(self) -> dict[str, Any]:
         """The fields of a LiveView from the signal; none before the second frame."""

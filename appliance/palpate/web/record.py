@@ -20,7 +20,7 @@ from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, FormatError, NoAnswer
 from palpate.core.health import Health
 from palpate.core.observer import Observer
-from palpate.core.sentences import Reply
+from palpate.core.sentences import Reply, future_of
 from palpate.core.status import REASONS
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.io.robot_link import PAIRS, Command
@@ -111,14 +111,9 @@ class CommandQueue:
             return False
         command, answer = waiting
         try:
-            reply = obey(command)
+            future_of(obey(command)).add_done_callback(partial(_pass_on, answer))
         except ApplianceError as e:
             answer.set_exception(e)
-            return True
-        if isinstance(reply, Future):
-            reply.add_done_callback(partial(_pass_on, answer))
-        else:
-            answer.set_result(reply)
         return True
 
     def refuse(self) -> None:

@@ -9,22 +9,25 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from palpate.alignment import live
 from palpate.alignment.lines import LinePrinter, line
-from palpate.alignment.live import Alignment, Expected
-from palpate.alignment.view import View, figure
+from palpate.alignment.live import ContactTracker, Expected
+from palpate.alignment.view import View
 from palpate.answer.contact import ContactPositions
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.cli.main import main
 from palpate.core import config
 from palpate.core.interrupts import StopFlag
+from palpate.io import skins
 from palpate.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND
@@ -43,21 +46,17 @@ def views_of(
 ) -> Callable[[float], list[View]]:
     """A function that reads the skin of `simulated` for some seconds and returns the Views."""
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
-    alignment = Alignment(
-        settings, model if isinstance(model, Expected) else Expected.by(model), simulated
-    )
+    expected = model if isinstance(model, Expected) else Expected.by(model)
+    sensor = skins.sensor(settings, expected.format, simulated)
+    tracker = ContactTracker(expected, simulated.source)
 
     def views(seconds: float) -> list[View]:
-        seen, end_ns, next_ns = (
-            [],
-            simulated.clock.now_ns() + round(seconds * SECOND),
-            simulated.clock.now_ns(),
+        seen: list[View] = []
+        end_ns = simulated.clock.now_ns() + round(seconds * SECOND)
+        display = SimpleNamespace(show=seen.append)
+        live.run(
+            sensor, tracker, [display], simulated.clock, lambda: simulated.clock.now_ns() >= end_ns
         )
-        while simulated.clock.now_ns() < end_ns:
-            alignment.read()
-            if simulated.clock.now_ns() >= next_ns:
-                next_ns = simulated.clock.now_ns() + live.VIEW_NS
-                seen.append(alignment.view())
         return seen
 
     return views
@@ -240,7 +239,9 @@ def test_a_view_is_shown_five_times_a_second_and_printed_once(model, monkeypatch
         settings = simulated.wire(config.load(None, [], site=NO_SITE))
         printer = LinePrinter(out, simulated.clock, line)
         stopped = lambda: simulated.clock.now_ns() >= end_ns  # noqa: B023, E731
-        live.run(settings, Expected.by(model), simulated, [printer], stopped)
+        tracker = ContactTracker(Expected.by(model), simulated.source)
+        with closing(skins.sensor(settings, model.format, simulated)) as sensor:
+            live.run(sensor, tracker, [printer], simulated.clock, stopped)
         assert len(out.getvalue().splitlines()) in lines
         assert not simulated.backend.board.running
 
@@ -267,19 +268,3 @@ def test_ctrl_c_ends_it(folder):
         assert run.wait(60) == 130
         assert (first + run.stdout.read()).count("reading the unloaded skin") >= 1
     assert "\033" not in first
-
-
-@pytest.mark.parametrize(
-    ("value", "full", "unit", "text"),
-    [
-        (1.254, 2.0, "N", "1.25"),
-        (31.0, 200.0, "N", "31.00"),
-        (1.254, 2.0, "", "1"),
-        (1.254, 2.0, "uT", "1.25"),
-        (31.04, 60.0, "uT", "31.0"),
-        (310.4, 600.0, "uT", "310"),
-    ],
-)
-def test_newtons_have_two_digits(value, full, unit, text):
-    """Raw counts have none, other units as many as three digits in all leave."""
-    assert figure(value, full, unit) == text

@@ -32,7 +32,7 @@ def monitor(taxels: np.ndarray, dtype: str = "float32", piece: int = 7) -> dict[
     rows, cols, *axes = taxels.shape[1:]
     watched = SkinMonitor(SweepFormat(rows, cols, RATE, 2 * RATE, dtype, *axes))
     for at in range(0, len(taxels), piece):
-        watched.put(frames(taxels[at : at + piece].astype(dtype), at))
+        watched.take(frames(taxels[at : at + piece].astype(dtype), at))
     return watched.measured()
 
 
@@ -93,7 +93,7 @@ def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew(
     """Before the second frame nothing is measured and a new skin starts anew."""
     watched = SkinMonitor(SweepFormat(3, 4, RATE, 200, "float32"))
     assert watched.measured() == {}
-    watched.put(frames(signal(1)))
+    watched.take(frames(signal(1)))
     assert watched.measured()["rate_hz"]
     watched.reset()
     assert watched.measured() == {}
