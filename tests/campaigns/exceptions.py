@@ -231,7 +231,7 @@ def _stand_before(box: Box, calls: ThrowingCalls) -> EdgeLog:
     """Put proxies before the parts of a box; its trigger, which notes its edges."""
     edges = EdgeLog(box._trigger)
     parts = {"sensor": box._sensor, "trigger": edges, "cutter": box._cutter, "port": box._port}
-    parts |= {"answerer": box._answerer, "panel": box._panel, "clock": box._clock}
+    parts |= {"answerer": box._answerer, "lines": box._lines, "clock": box._clock}
     parts |= {"early": box._early} if box._early else {}
     for name, part in parts.items():
         setattr(box, f"_{name}", ThrowingPart(part, name, calls))

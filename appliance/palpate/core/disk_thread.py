@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
@@ -27,23 +27,8 @@ def nothing(result: object) -> None:
     """Ignore a result."""
 
 
-class DiskWork(Protocol):
-    """Does work on the disk, in order."""
-
-    def __call__(
-        self, work: Callable[[], Result], done: Callable[[Result], object] = nothing
-    ) -> bool:
-        """Do `work` now or later, then give its result to `done` in the loop's thread. Returns
-        False, and does nothing, if too much work is waiting."""
-        ...
-
-    def settle(self) -> bool:
-        """Wait until all work is done, at most SETTLE_S. Returns whether it is."""
-        ...
-
-
 class AtOnce:
-    """Does the work in the call."""
+    """Does the work in the call, for programs that may wait."""
 
     def __call__(
         self, work: Callable[[], Result], done: Callable[[Result], object] = nothing
@@ -56,9 +41,10 @@ class AtOnce:
 
 
 class DiskThread(Observer):
-    """Does the work in a thread. As an observer of the loop it gives results back in each turn, so
-    it comes before the observers that use it. most: pieces of work that may wait. refused: number
-    of pieces that were refused, and so lost."""
+    """Does work in a thread, in order, and gives its result to `done` in the loop's thread. A call
+    returns False, and does nothing, if too much work is waiting. As an observer of the loop it
+    gives results back in each turn, so it comes before the observers that use it. most: pieces of
+    work that may wait. refused: number of pieces that were refused, and so lost."""
 
     def __init__(self, most: int = MOST_WAITING) -> None:
         self.refused = 0
@@ -102,6 +88,7 @@ class DiskThread(Observer):
         self.settle()
 
     def settle(self) -> bool:
+        """Wait until all work is done, at most SETTLE_S. Returns whether it is."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._results) == self._open, SETTLE_S)
         self._give_back()
@@ -132,6 +119,9 @@ class DiskThread(Observer):
             self._results.append(lambda e=e: _throw(e))  # type: ignore[misc]
         else:
             self._results.append(lambda: done(result))
+
+
+DiskWork = AtOnce | DiskThread
 
 
 def _throw(e: Exception) -> None:

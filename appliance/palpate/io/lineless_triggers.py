@@ -15,7 +15,7 @@ import termios
 import tty
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Protocol, Self
+from typing import Self
 
 from palpate.core.clock import Clock
 from palpate.core.config import TriggerConfig
@@ -60,18 +60,12 @@ class LinelessTrigger:
         return taken
 
 
-class Told(Protocol):
-    """Is told that START or STOP has come as a command."""
-
-    def __call__(self, t_ns: int, *, start: bool) -> None: ...
-
-
 class CommandTrigger(LinelessTrigger):
     """START and STOP as commands on the serial line; `commands` has their handlers. START raises
     ApplianceError as `slide_values` does. told: is called with the time of each, for a simulated
     finger."""
 
-    def __init__(self, clock: Clock, told: Told | None = None) -> None:
+    def __init__(self, clock: Clock, told: Callable[..., None] | None = None) -> None:
         super().__init__("serial", "arrival of the command")
         self._clock, self._told = clock, told
         self.commands: Mapping[str, Callable[[str], list[object]]] = {

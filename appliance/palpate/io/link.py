@@ -17,12 +17,8 @@ TTY_BYTES = 4095
 _MOST_BYTES = 4 * packets.MAX_PAYLOAD
 
 
-class SkinLink(Protocol):
-    """An opened readout board. Each failure raises the SensorError that explains it."""
-
-    def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request; returns a reply of at most `length` bytes, b"" for length 0."""
-        ...
+class Readable(Protocol):
+    """An opened skin. Each failure raises the SensorError that explains it."""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
         """At most `size` bytes; b"" if none came within `timeout_ms`."""
@@ -31,6 +27,20 @@ class SkinLink(Protocol):
     def close(self) -> None:
         """Ask the readout board to stop, unless it is gone, and release it."""
         ...
+
+
+class SkinLink(Readable, Protocol):
+    """An opened readout board."""
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """Send a request; returns a reply of at most `length` bytes, b"" for length 0."""
+        ...
+
+
+class BytePort(Readable, Protocol):
+    """An opened port, as SerialLink is."""
+
+    def write(self, data: bytes) -> None: ...
 
 
 def reply_to(request: packets.Request, read: Callable[[int, int], bytes], clock: Clock) -> bytes:

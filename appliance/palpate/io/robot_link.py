@@ -15,7 +15,7 @@ import termios
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 import serial
 
@@ -43,30 +43,6 @@ MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
 changes would otherwise be answered without end."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
-
-
-class Port(Protocol):
-    """A serial line to the robot controller, for sentences and commands. name: of the port, for
-    messages. dropped: number of sentences that were not sent. trouble: the reason why the line does
-    not work, "" if it does."""
-
-    name: str
-    dropped: int
-    trouble: str
-
-    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Send a verdict's sentence without waiting. loss_known: see `result`."""
-        ...
-
-    def say(self, line: bytes) -> None:
-        """Send a sentence without waiting."""
-        ...
-
-    def commands(self) -> list[Command]:
-        """The commands that have come since the last call."""
-        ...
-
-    def close(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +92,8 @@ def command(name: str, text: str | None = None) -> Command:
 
 class StdoutPort:
     """Sentences on standard output, used if no serial port is configured. commands: another source
-    of commands, since standard output has none."""
+    of commands, since standard output has none. name: for messages. dropped: number of sentences
+    that were not sent. trouble: the reason why the line does not work, "" if it does."""
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
         self.name, self.dropped, self.trouble = "standard output", 0, ""
@@ -268,3 +245,7 @@ class SerialSink:
         self.close()
         self._begun = 0
         self._retry_ns = self._clock.now_ns() + RETRY_NS
+
+
+Port = SerialSink | StdoutPort
+"""The line to the robot, for sentences and commands; neither waits."""

@@ -10,14 +10,13 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Protocol
 
 from palpate.core.clock import Clock
 from palpate.core.config import SkinConfig
 from palpate.core.errors import SensorError, SensorMismatch
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, serial_port, skin_stream
-from palpate.io.link import SkinLink
+from palpate.io.link import BytePort, Readable
 from palpate.io.sensor import TransferObserver
 from palpate.io.serial_link import COLLECT_NS, SerialLink, find
 from palpate.io.serial_port import PortInfo
@@ -32,29 +31,12 @@ QUIET_NS = 2_000_000
 on a line that both sides share."""
 
 
-class BytePort(Protocol):
-    """An opened port, as SerialLink is."""
-
-    def write(self, data: bytes) -> None: ...
-
-    def read(self, size: int, timeout_ms: int) -> bytes: ...
-
-    def close(self) -> None: ...
-
-
 class ProfileLink:
     """A port whose skin gets the stop commands of its profile before the port is released."""
 
     def __init__(self, port: BytePort, stop: Iterable[bytes]) -> None:
         self._port, self._stop = port, list(stop)
         self.read: Callable[[int, int], bytes] = port.read
-
-    def request(self, request: packets.Request, length: int) -> bytes:
-        """Raises SensorMismatch: these skins do not answer requests."""
-        raise SensorMismatch(
-            f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}; "
-            "leave this out of its profile"
-        )
 
     def close(self) -> None:
         """Send the stop commands, unless the skin is gone, and release the port."""
@@ -82,7 +64,7 @@ class PollingLink(ProfileLink):
         self._next, self._next_ns, self._waits_until_ns = 0, clock.now_ns(), 0
 
     def _read(self, size: int, timeout_ms: int) -> bytes:
-        """As `SkinLink.read`, asking in between."""
+        """As `Readable.read`, asking in between."""
         until_ns = self._clock.now_ns() + timeout_ms * 1_000_000
         while (now_ns := self._clock.now_ns()) < until_ns:
             due_ns = max(self._next_ns, self._waits_until_ns)
@@ -151,7 +133,7 @@ class SerialSensor(LinkSensor):
     def _proven(self, now_ns: int) -> bool:
         return now_ns >= self._tared_ns and super()._proven(now_ns)
 
-    def _open(self) -> tuple[SkinLink, packets.Identity]:
+    def _open(self) -> tuple[Readable, packets.Identity]:
         self._check_format()
         there = self._ports()
         path = self._config.port or find(self._profile.ids, self._config.serial, there)

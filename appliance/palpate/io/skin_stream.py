@@ -21,7 +21,7 @@ from palpate.core.errors import SensorMismatch
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from palpate.io import packets, skin_codecs
 from palpate.io.link import TTY_BYTES
-from palpate.io.sensor import FrameStream, SensorCounters
+from palpate.io.sensor import SensorCounters
 from palpate.io.skin_codecs import Codec, Decoded, Rest
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.usb_sensor import Stream
@@ -234,6 +234,9 @@ class CountedStream:
         pace = self._watch.pace
         if pace and abs(pace - 1) > RATE_WANDER:
             raise SensorMismatch(another_rate(pace * self._format.rate_hz, self._format.rate_hz))
+
+
+FrameStream = Stream | CountedStream
 
 
 def another_rate(measured_hz: float, wanted_hz: float) -> str:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,8 +27,11 @@ from palpate.core.errors import (
 )
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat, shown
 from palpate.io import packets
-from palpate.io.link import SkinLink
-from palpate.io.sensor import OPENED, FrameStream, SensorCounters, TransferObserver
+from palpate.io.link import Readable, SkinLink
+from palpate.io.sensor import OPENED, SensorCounters, TransferObserver
+
+if TYPE_CHECKING:
+    from palpate.io.skin_stream import FrameStream
 
 RATE_TOLERANCE = 0.01
 """Largest relative difference of the board's rate from the bundle's, for crystals and timers."""
@@ -53,7 +56,8 @@ _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 class Stream:
     """Converts the bytes of a readout board to Frames with unwrapped numbers and host times. It
     does no I/O, and counts damaged data. unpack: finds the packets in bytes, as `packets.unpack`
-    does."""
+    does. loss_known: every lost frame is seen, as the skin counts its frames. misfit: why bytes are
+    not frames, and the remedy, as far as it shows."""
 
     loss_known = True
     misfit = ""
@@ -165,10 +169,10 @@ class LinkSensor(ABC):
     States: `streaming`, from the first frame on; or `absent`, `busy`, `denied`, `mismatch`, `lost`,
     `silent`, with a remedy in `trouble`. A skin that is plugged in again begins a new enumeration:
     its frames get a new epoch in `seq` and a new clock. announced: the skin reports its format when
-    it is opened. waits: whether `read` waits for a skin that is away.
+    it is opened.
     """
 
-    announced, waits = True, True
+    announced = True
 
     def __init__(
         self,
@@ -184,7 +188,7 @@ class LinkSensor(ABC):
         self.counters = SensorCounters()
         self._config, self._format, self._clock, self._tap = config, format, clock, tap
         self._stream = stream(self.counters)
-        self._link: SkinLink | None = None
+        self._link: Readable | None = None
         self._retry_ns = clock.now_ns()
         self._quiet_ns = 0  # time since the last frame, or since the skin was opened
         self._read_ns = 0  # end of the last read
@@ -247,7 +251,7 @@ class LinkSensor(ABC):
             link.close()
 
     @abstractmethod
-    def _open(self) -> tuple[SkinLink, packets.Identity]:
+    def _open(self) -> tuple[Readable, packets.Identity]:
         """Find, open, check and start the skin. Raises SensorError, with nothing left open."""
         ...
 
@@ -264,9 +268,8 @@ class LinkSensor(ABC):
         """Find, open, check and start the skin; False, with state and trouble, if it fails."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
-            if self.waits:
-                timeout_ns = self._config.timeout_ms * 1_000_000
-                self._clock.sleep_until(min(self._retry_ns, now + timeout_ns))
+            timeout_ns = self._config.timeout_ms * 1_000_000
+            self._clock.sleep_until(min(self._retry_ns, now + timeout_ns))
             return False
         try:
             self._link, self.identity = self._open()

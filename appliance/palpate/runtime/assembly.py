@@ -38,9 +38,8 @@ from palpate.io.lineless_triggers import (
 from palpate.io.robot_link import Port, SerialSink, StdoutPort
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.io.verdict_lines import LineSink, check_bits
-from palpate.runtime.loop import Box, Panel, Pipeline
+from palpate.runtime.loop import Answerer, Box, Pipeline
 from palpate.sweeps.capture import CaptureWriter
-from palpate.sweeps.sweep_check import SweepCheck
 from palpate.sweeps.sweep_window import SweepCutter
 
 UNSIGNED = (
@@ -49,17 +48,6 @@ UNSIGNED = (
 )
 """Warning text, after the word "unsigned", shown while classifier.allow_unsigned is set."""
 NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
-
-
-class NotServing:
-    """The GPIO lines of a box without a bundle: READY stays low."""
-
-    def __init__(self, lines: Panel) -> None:
-        self._lines = lines
-
-    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Drive the lines; `ready` is ignored."""
-        self._lines.show(ready=False, busy=busy, fault=fault, decided=decided)
 
 
 def box(
@@ -79,7 +67,7 @@ def box(
 
 def assembled(
     settings: Config,
-    answerer: Classifier | SweepCheck,
+    answerer: Answerer,
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
@@ -113,7 +101,8 @@ def assembled(
         Pipeline(sensor, trigger, cutter, answerer, early),
         devices.clock,
         port=port,
-        panel=lines if serving or lines is None else NotServing(lines),
+        lines=lines,
+        serving=serving,
         observers=watching,
         commands=commands,
         source=devices.source,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -22,10 +22,13 @@ from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
 from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
+from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
+from palpate.io.gpio_lines import Lines
 from palpate.io.robot_link import Command, Port
 from palpate.io.sensor import Sensor, SensorCounters
 from palpate.io.trigger import Trigger
+from palpate.sweeps.sweep_check import SweepCheck
 from palpate.sweeps.sweep_window import SweepCutter
 
 TARE_S = 0.5
@@ -37,47 +40,8 @@ EVENTS = ("frames", "edges", "command", "answered", "sweep", "turn", "stopping")
 """The methods of an Observer."""
 
 
-class Panel(Protocol):
-    """The GPIO lines that show the robot the state of the box."""
-
-    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Drive READY, BUSY, FAULT and DECIDED."""
-        ...
-
-
-class Answerer(Protocol):
-    """Gives each sweep its verdict: the classifier, or SweepCheck without a bundle."""
-
-    @property
-    def format(self) -> SweepFormat: ...
-
-    @property
-    def model(self) -> str:
-        """The id of the bundle, "" without a bundle."""
-        ...
-
-    @property
-    def degraded(self) -> str:
-        """Taxels that are broken over the stream and bridged, "" for none."""
-        ...
-
-    def __call__(self, sweep: Sweep) -> Verdict: ...
-
-    def about(self) -> dict[str, Any]:
-        """Entries for the sidecar of a recorded sweep, for JSON."""
-        ...
-
-    def describe(self) -> list[object]:
-        """The first fields of the answer to ID: name, version, id, format."""
-        ...
-
-    def test(self) -> str:
-        """Run a self-test; returns its result in words. Raises ApplianceError if it fails."""
-        ...
-
-    def set_tare(self, taxels: NDArray[Any]) -> str:
-        """Take frames [n, R, C] as the unloaded skin; returns a message for a person."""
-        ...
+Answerer = Classifier | SweepCheck
+"""Gives each sweep its verdict: with a bundle, or without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +59,10 @@ class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer,
     listen.
 
-    port: sends verdicts and state sentences and receives commands, or None. panel: READY, BUSY,
-    FAULT, DECIDED, or None. observers: called in this order, after the port. commands: further
-    commands by name. source: origin of the frames, as in sentences. state_s: time between two state
-    sentences.
-    """
+    port: sends verdicts and state sentences and receives commands, or None. lines: READY, BUSY,
+    FAULT, DECIDED, or None. serving: whether READY may rise. observers: called in this order, after
+    the port. commands: further commands by name. source: origin of the frames, as in sentences.
+    state_s: time between two state sentences."""
 
     def __init__(
         self,
@@ -107,7 +70,8 @@ class Box:
         clock: Clock,
         *,
         port: Port | None = None,
-        panel: Panel | None = None,
+        lines: Lines | None = None,
+        serving: bool = True,
         observers: Sequence[Observer] = (),
         commands: Mapping[str, CommandHandler] = MappingProxyType({}),
         source: str = "usb",
@@ -122,7 +86,8 @@ class Box:
         self._sensor, self._trigger = pipeline.sensor, pipeline.trigger
         self._cutter = pipeline.cutter
         self._answerer, self._early = pipeline.answerer, pipeline.early
-        self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
+        self._clock, self._port, self._commands = clock, port, commands
+        self._lines, self._serving = lines, serving
         self._source, self._state_ns = source, round(state_s * 1e9)
         # only overridden methods of observers are called, so nothing is computed in vain
         self._on: dict[str, list[Callable[..., None]]] = {
@@ -244,10 +209,9 @@ class Box:
     def _show(self) -> None:
         sweeping, able = self._cutter.sweeping, self._able
         self._decided = self._decided and not sweeping
-        if self._panel:
-            self._panel.show(
-                ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided
-            )
+        if self._lines:
+            ready = self._serving and able and not sweeping
+            self._lines.show(ready=ready, busy=sweeping, fault=not able, decided=self._decided)
 
     def _decide(self, now_ns: int) -> list[Verdict]:
         """Answer the open sweep early, if the settings allow it and the bundle can."""

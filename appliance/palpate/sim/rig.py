@@ -12,7 +12,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator, MutableSequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from palpate.core.clock import Clock
 from palpate.core.types import SweepFormat
 from palpate.io import packets
+from palpate.sim.gpio import SimGpio
 
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
@@ -82,14 +83,6 @@ class Act:
         return replace(self, frames=self.frames[of])
 
 
-class EdgeLines(Protocol):
-    """Receives the robot's edges: SimGpio, or a list of a test."""
-
-    def drive(self, name: str, level: bool, t_ns: int) -> None: ...
-
-    def forget(self, name: str, t_ns: int) -> None: ...
-
-
 class Robot:
     """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their
     frames.
@@ -104,7 +97,7 @@ class Robot:
     def __init__(
         self,
         script: Iterator[Act],
-        lines: EdgeLines,
+        lines: SimGpio,
         *,
         start: str,
         stop: str,

@@ -12,13 +12,12 @@ from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gpiod  # noqa: F401 - the box's, which the simulated lines import as well
 import numpy as np
 
 from palpate.core.clock import Clock, SystemClock
-from palpate.core.observer import Observer
 from palpate.core.types import SweepFormat
 from palpate.runtime.loop import Box
 
@@ -29,12 +28,9 @@ MEMORY_SWEEPS, STREAM_S = 1000, 15.0
 NAMES = ("memory", "stream")
 
 
-class Build(Protocol):
-    """Builds a box on simulated devices; returns it and the robot's end of its line."""
-
-    def __call__(
-        self, simulated: devices.SimDevices, stack: ExitStack, /, observers: Iterable[Observer] = ()
-    ) -> tuple[Box, int]: ...
+Build = Callable[..., tuple[Box, int]]
+"""Builds a box on simulated devices, for a stack and with observers; returns it and the robot's end
+of its line."""
 
 
 def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:

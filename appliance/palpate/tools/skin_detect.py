@@ -14,9 +14,9 @@ from palpate.core.config import SkinConfig
 from palpate.core.errors import FormatError, SensorError
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, skin_codecs, wire_numbers
-from palpate.io.link import SkinLink, reply_to
+from palpate.io.link import BytePort, SkinLink, reply_to
 from palpate.io.serial_port import PortInfo
-from palpate.io.serial_sensor import BytePort, requests, started
+from palpate.io.serial_sensor import requests, started
 from palpate.io.skin_codecs import Rest
 from palpate.io.skin_profile import DEFAULT, SkinProfile
 from palpate.tools import skin_text

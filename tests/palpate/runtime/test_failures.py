@@ -152,7 +152,7 @@ def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(rigged)
     def show(**levels: bool) -> None:
         raise LineError("chip is gone")
 
-    box.box._panel.show = show
+    box.box._lines.show = show
     with pytest.raises(LineError):
         box.box.run(lambda: False)
     assert heard(box) == [(1, "aborted")]
