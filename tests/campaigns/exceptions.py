@@ -37,7 +37,7 @@ SLIDE_S, PAUSE_S, END_S = 2.6, 0.4, 8.5
 SURVIVES = re.compile(r"answerer|early|observer\..*")
 """Calls whose unexpected errors must not end the program."""
 LASTING = re.compile(
-    r"answerer|early|observer\..*|sensor\.read|trigger\.edges|panel\..*|port\.(?!send).*"
+    r"answerer|early|observer\..*|sensor\.read|trigger\.edges|lines\..*|port\.(?!send).*"
 )
 """Calls that may fail again and again: devices, models, observers. Others only compute."""
 

@@ -30,130 +30,73 @@ class CommandEntry(NamedTuple):
 
 _SKIN = "sim skin virtual seed port"
 _TIMES = "trigger every sweep capture"
+_Row = CommandEntry
+# fmt: off
 _BUNDLES = {
-    "list": CommandEntry(
-        "show which bundle runs, and which bundle `rollback` returns to",
-        "cli.bundle_commands.run_list",
-        "json",
-    ),
-    "install": CommandEntry(
-        "check the signed bundle in DIR, and run it on trial from the next start on",
-        "cli.bundle_commands.run_install",
-        "folder candidate other-skin",
-    ),
-    "verify": CommandEntry(
-        "check the signed bundle in DIR, and change nothing",
-        "cli.bundle_commands.run_verify",
-        "folder",
-    ),
-    "commit": CommandEntry(
-        "end the trial of the bundle that runs: it stays", "cli.bundle_commands.run_commit"
-    ),
-    "rollback": CommandEntry(
-        "go back to the previous bundle, from the next start on",
-        "cli.bundle_commands.run_rollback",
-    ),
-    "promote": CommandEntry(
-        "run the candidate on trial from the next start on", "cli.bundle_commands.run_promote"
-    ),
+    "list": _Row("show which bundle runs, and which bundle `rollback` returns to",
+        "cli.bundle_commands.run_list", "json"),
+    "install": _Row("check the signed bundle in DIR, and run it on trial from the next start on",
+        "cli.bundle_commands.run_install", "folder candidate other-skin"),
+    "verify": _Row("check the signed bundle in DIR, and change nothing",
+        "cli.bundle_commands.run_verify", "folder"),
+    "commit": _Row("end the trial of the bundle that runs: it stays",
+        "cli.bundle_commands.run_commit"),
+    "rollback": _Row("go back to the previous bundle, from the next start on",
+        "cli.bundle_commands.run_rollback"),
+    "promote": _Row("run the candidate on trial from the next start on",
+        "cli.bundle_commands.run_promote"),
 }
 _SKINS = {
-    "list": CommandEntry(
-        "show all profiles, with missing features, and whether a device was measured",
-        "cli.skin_commands.run_list",
-    ),
-    "detect": CommandEntry(
-        "find connected skins and the profiles that fit; sends nothing, and opens only the ports"
-        " on USB, or --port",
-        "cli.skin_commands.run_detect",
-        "port write",
-    ),
-    "new": CommandEntry(
-        "write a profile for the lines of numbers that a skin sends",
-        "cli.skin_commands.run_new",
-        "profile needed-port baud grid profiles",
-    ),
-    "check": CommandEntry(
-        "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
-        "cli.skin_commands.run_check",
-        f"{_SKIN} seconds",
-    ),
-    "show": CommandEntry(
-        "show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
-        "cli.skin_commands.run_show",
-        f"{_SKIN} local-page",
-    ),
-    "align": CommandEntry(
-        "show where the contact lies on the skin, and where it should",
-        "cli.skin_commands.run_align",
-        f"{_SKIN} local-page",
-    ),
+    "list": _Row("show all profiles, with missing features, and whether a device was measured",
+        "cli.skin_commands.run_list"),
+    "detect": _Row("find connected skins and the profiles that fit; sends nothing, and opens only"
+        " the ports on USB, or --port", "cli.skin_commands.run_detect", "port write"),
+    "new": _Row("write a profile for the lines of numbers that a skin sends",
+        "cli.skin_commands.run_new", "profile needed-port baud grid profiles"),
+    "check": _Row("compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
+        "cli.skin_commands.run_check", f"{_SKIN} seconds"),
+    "show": _Row("show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
+        "cli.skin_commands.run_show", f"{_SKIN} local-page"),
+    "align": _Row("show where the contact lies on the skin, and where it should",
+        "cli.skin_commands.run_align", f"{_SKIN} local-page"),
 }
 GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
     "run": {
-        "run": CommandEntry(
-            "classify sweeps until SIGTERM",
-            "cli.run_command.run",
-            f"{_SKIN} sweeps {_TIMES} shadow",
-        ),
-        "demo": CommandEntry(
-            "watch simulated sweeps being classified",
-            "cli.simulated_commands.run_demo",
-            f"{_SKIN} sweeps raw",
-        ),
+        "run": _Row("classify sweeps until SIGTERM", "cli.run_command.run",
+            f"{_SKIN} sweeps {_TIMES} shadow"),
+        "demo": _Row("watch simulated sweeps being classified", "cli.simulated_commands.run_demo",
+            f"{_SKIN} sweeps raw"),
     },
     "look": {
-        "check": CommandEntry(
-            "test bundle, golden sweeps and devices, show the settings, or measure this machine",
-            "cli.look_commands.run_check",
-            f"{_SKIN} settings|bench figures references part acts",
-        ),
-        "status": CommandEntry(
-            "show the state of the service, and its last verdicts",
-            "cli.status_command.run",
-            "json since network",
-        ),
-        "watch": CommandEntry(
-            "show the running box live: a line a verdict, or a page",
-            "cli.look_commands.run_watch",
-            "feed|watch-page",
-        ),
-        "replay": CommandEntry(
-            "classify a capture, a kept sweep or a folder of them again",
-            "cli.look_commands.run_replay",
-            "file",
-        ),
+        "check": _Row("test bundle, golden sweeps and devices, show the settings, or measure this"
+            " machine", "cli.look_commands.run_check",
+            f"{_SKIN} settings|bench figures references part acts"),
+        "status": _Row("show the state of the service, and its last verdicts",
+            "cli.status_command.run", "json since network"),
+        "watch": _Row("show the running box live: a line a verdict, or a page",
+            "cli.look_commands.run_watch", "feed|watch-page"),
+        "replay": _Row("classify a capture, a kept sweep or a folder of them again",
+            "cli.look_commands.run_replay", "file"),
     },
     "record and learn": {
-        "record": CommandEntry(
-            "keep each sweep with its label, for training; needs no bundle",
-            "cli.record_command.run",
-            f"{_SKIN} sweeps {_TIMES} out material position session format window target"
-            " record-page",
-        ),
-        "teach": CommandEntry(
-            "learn materials from sweeps at the robot, without a desktop",
-            "cli.teach_command.run",
-            f"{_SKIN} {_TIMES} label good place attachment format window use unknown forget by"
-            " steps teach-page",
-        ),
+        "record": _Row("keep each sweep with its label, for training; needs no bundle",
+            "cli.record_command.run", f"{_SKIN} sweeps {_TIMES} out material position session"
+            " format window target record-page"),
+        "teach": _Row("learn materials from sweeps at the robot, without a desktop",
+            "cli.teach_command.run", f"{_SKIN} {_TIMES} label good place attachment format window"
+            " use unknown forget by steps teach-page"),
     },
     "bundles": {
-        "bundles": CommandEntry(
-            "list, install, verify, commit, rollback or promote bundles of this box",
-            "cli.bundle_commands.run_list",
-            "json",
-            _BUNDLES,
-        ),
+        "bundles": _Row("list, install, verify, commit, rollback or promote bundles of this box",
+            "cli.bundle_commands.run_list", "json", _BUNDLES),
     },
     "devices": {
-        "skin": CommandEntry("list, detect, describe, check, show or align skins", "", "", _SKINS),
-        "bridge": CommandEntry(
-            "pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
-            "bridges.command.run",
-        ),
+        "skin": _Row("list, detect, describe, check, show or align skins", "", "", _SKINS),
+        "bridge": _Row("pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
+            "bridges.command.run"),
     },
 }
+# fmt: on
 """All commands of `palpate`, by heading."""
 LOOK: Any = {"epilog": EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
 COMMANDS: Mapping[str, CommandEntry] = {n: c for group in GROUPS.values() for n, c in group.items()}
