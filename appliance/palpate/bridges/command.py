@@ -22,6 +22,7 @@ from palpate.core import config, sentences
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config, StoreConfig
 from palpate.core.errors import ApplianceError, ConfigError, LinkLost
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import log, to_stderr
 from palpate.core.retry import retried
 from palpate.core.sentences import MOST_FINGERS, Sentence
@@ -256,14 +257,9 @@ def run_fuse(args: argparse.Namespace) -> int:
             if (command := heard.popleft()).kind not in sentences.OWN:
                 send(hand.reply(command))
 
-    async def serve() -> int:
-        stop = stop_event()
-        await until(stop, 0, partial(asyncio.to_thread, work))
-        return stop.code
-
     log.info(f"fuse: {' and '.join(each)}, sentences to {port or 'standard output'}")
     try:
-        return asyncio.run(serve())
+        return _repeated(work)
     finally:
         for feed in each.values():
             feed.close()
@@ -282,15 +278,19 @@ def run_memory(args: argparse.Namespace) -> int:
     file = VerdictFile(args.file or Path(settings.bridge.memory))
     memory = MemoryBridge(feed, file, SystemClock())
 
-    async def serve() -> int:
-        stop = stop_event()
-        await until(stop, 0, partial(asyncio.to_thread, memory.work))
-        return stop.code
-
     try:
-        return asyncio.run(serve())
+        return _repeated(memory.work)
     finally:
         memory.close()
+
+
+def _repeated(work: Callable[[], object]) -> int:
+    """Work until SIGTERM; the exit code."""
+    stopped = StopFlag()
+    while not stopped():
+        work()
+    log.info("stopped")
+    return stopped.exit_code
 
 
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {

@@ -3,7 +3,8 @@ labels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from palpate.answer.unknown import Classes
 from palpate.bundle.manifest import Manifest
 from palpate.core.types import SweepFormat
+
+_LISTS = ("means", "sweeps", "spread", "golden")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +44,20 @@ class AddedLabels:
     least: float
     displays: tuple[str, ...]
 
+    def only(self, kept: Sequence[int]) -> AddedLabels:
+        """The labels with these indices; the logits are still those of all."""
+        lists: dict[str, Any] = {name: getattr(self, name)[kept] for name in _LISTS}
+        labels, displays = (tuple(of[k] for k in kept) for of in (self.labels, self.displays))
+        return replace(self, labels=labels, displays=displays, **lists)
+
+    def plus(self, other: AddedLabels) -> AddedLabels:
+        """These labels and those of `other`, with its logits and its rule."""
+        lists: dict[str, Any] = {
+            name: np.concatenate([getattr(one, name) for one in (self, other)]) for name in _LISTS
+        }
+        labels, displays = self.labels + other.labels, self.displays + other.displays
+        return replace(other, labels=labels, displays=displays, **lists)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
@@ -56,6 +73,7 @@ class Bundle:
         classes include them.
     base: sha256 of manifest.json in the bundle's folder, "" for a bundle that was not read from a
         folder.
+    before: the bundle without the added labels, None without such labels.
     """
 
     manifest: Manifest
@@ -67,6 +85,7 @@ class Bundle:
     added: AddedLabels | None = None
     base: str = ""
     golden_refusals: tuple[str, ...] = ()
+    before: Bundle | None = None
 
     @property
     def enrolled(self) -> dict[str, int]:

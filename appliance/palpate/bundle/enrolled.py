@@ -47,47 +47,30 @@ def file(added: AddedLabels) -> bytes:
 def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
     """`bundle` with the labels of `data`, under this id. Raises BundleError if `data` is malformed
     or is the enrolment of another bundle."""
-    added = _read(bundle, data)
-    for k, label in enumerate(added.labels):
-        bundle = with_label(
-            bundle,
-            (label, added.displays[k]),
-            added.means[k],
-            int(added.sweeps[k]),
-            float(added.spread[k]),
-            added.golden[k],
-        )
+    return joined(bundle, _read(bundle, data), identity)
+
+
+def joined(bundle: Bundle, added: AddedLabels, identity: str) -> Bundle:
+    """`bundle` with these labels, under this id. Raises BundleError for a label that is taken or
+    cannot be sent, and for numbers out of range."""
+    made = bundle
+    for k in range(len(added.labels)):
+        made = _with_label(made, added, k)
+    assert made.classes
+    assert made.manifest.known
+    arrays.check_classes(made.classes.arrays(), len(made.manifest.labels), 0)
+    known = replace(made.manifest.known, enrolled=added.least)
+    manifest = replace(made.manifest, known=known)
+    more = {"manifest": manifest, "golden_logits": added.logits, "id": identity, "added": added}
+    return replace(made, before=bundle, **more)  # type: ignore[arg-type]
+
+
+def _with_label(bundle: Bundle, added: AddedLabels, k: int) -> Bundle:
+    """`bundle` with the label `k` as well. Id and logits of golden sweeps do not change. The early
+    heads do not have the label, and the figures of `bundle` no longer hold, so both are removed."""
     assert bundle.classes
-    arrays.check_classes(bundle.classes.arrays(), len(bundle.manifest.labels), 0)
-    return replace(
-        deciding(bundle, added.least), golden_logits=added.logits, id=identity, added=added
-    )
-
-
-def deciding(bundle: Bundle, least: float) -> Bundle:
-    """`bundle` with this rule for enrolled labels (Known.enrolled). Raises BundleError."""
-    assert bundle.manifest.known
-    known = replace(bundle.manifest.known, enrolled=least)
-    return replace(bundle, manifest=replace(bundle.manifest, known=known))
-
-
-def with_label(
-    bundle: Bundle,
-    called: tuple[str, str],
-    mean: NDArray[np.float32],
-    sweeps: int,
-    spread: float,
-    golden: NDArray[Any],
-) -> Bundle:
-    """`bundle` with one more label, from the mean [r] of its sweeps in the embedding, and one
-    golden sweep [T, R, C] or [T, R, C, A]. The id and the logits of golden sweeps do not change.
-    called: the label and its name for people, "" for none.
-
-    The early heads do not have the label, and the figures of `bundle` no longer hold, so both are
-    removed. Raises BundleError for a label that is taken or cannot be sent.
-    """
-    assert bundle.classes
-    m, (label, display) = bundle.manifest, called
+    m, label, display = bundle.manifest, added.labels[k], added.displays[k]
+    sweeps = int(added.sweeps[k])
     manifest = replace(
         m,
         labels=(*m.labels, label),
@@ -97,13 +80,9 @@ def with_label(
         figures={},
         made=m.made | {"enrolled": bundle.enrolled | {label: sweeps}},
     )
-    classes = extended(bundle.classes, mean, sweeps, spread)
-    return replace(
-        bundle,
-        manifest=manifest,
-        classes=classes,
-        golden=np.concatenate([bundle.golden, golden[None]]),
-    )
+    classes = extended(bundle.classes, added.means[k], sweeps, float(added.spread[k]))
+    golden = np.concatenate([bundle.golden, added.golden[k][None]])
+    return replace(bundle, manifest=manifest, classes=classes, golden=golden)
 
 
 def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -> Classes:

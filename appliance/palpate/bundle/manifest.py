@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -95,35 +95,8 @@ class Manifest:
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
-        if type(self.schema) is not int or self.schema != SCHEMA:
-            raise BundleError(
-                f"manifest schema {self.schema} is unknown; this version reads {SCHEMA}: update "
-                "one of them"
-            )
-        if self.input not in INPUTS:
-            raise BundleError(
-                f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}"
-            )
-        _check_files(self.files)
-        _check_labels(self.labels)
-        _check_displays(self.displays, self.labels)
-        _check_thresholds(self.thresholds, self.format.rows * self.format.cols)
-        _check_parts(self)
-        if self.unloaded and len(self.unloaded) != self.format.channels:
-            raise BundleError(
-                f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have "
-                f"{self.format.channels}; export the bundle again"
-            )
-        if self.early and self.input != "raw":
-            raise BundleError(
-                f"manifest has `early`, but input {self.input!r} needs the whole window; export it "
-                "without"
-            )
-        if type(self.counter) is not int or not 0 <= self.counter < 1 << 53:
-            raise BundleError(
-                f"manifest counter {self.counter!r} must be a whole number from 0 on; sign the "
-                "bundle again"
-            )
+        for why in _faults(self):
+            raise BundleError(f"manifest {why}; export the bundle again")
         version(self.runtime)
 
     @property
@@ -166,8 +139,25 @@ def version(text: object) -> tuple[int, ...]:
     return tuple(map(int, text.split(".")))
 
 
-def _check_thresholds(limits: Thresholds, taxels: int) -> None:
-    """Raises BundleError for a limit out of range. taxels: of the skin."""
+def _faults(m: Manifest) -> Iterator[str]:
+    """What is wrong with the values of a manifest."""
+    if type(m.schema) is not int or m.schema != SCHEMA:
+        yield f"schema {m.schema} is unknown, and this version reads {SCHEMA}: update one of them"
+    if m.input not in INPUTS:
+        yield f"input {m.input!r} is unknown: use one of {', '.join(INPUTS)}"
+    if m.unloaded and len(m.unloaded) != m.format.channels:
+        counts = f"{len(m.unloaded)} counts of the unloaded skin"
+        yield f"gives {counts}, its frames have {m.format.channels}"
+    if type(m.counter) is not int or not 0 <= m.counter < 1 << 53:
+        yield f"counter {m.counter!r} must be a whole number from 0 on: sign the bundle again"
+    yield from _wrong_files(m.files)
+    yield from _wrong_names(m.labels, m.displays)
+    yield from _wrong_thresholds(m.thresholds, m.format.rows * m.format.cols)
+    yield from _wrong_parts(m)
+
+
+def _wrong_thresholds(limits: Thresholds, taxels: int) -> Iterator[str]:
+    """A limit out of range. taxels: of the skin."""
     ranges = (
         ("contact", 0, sys.float_info.max),
         ("full_scale", sys.float_info.min, sys.float_info.max),
@@ -178,97 +168,56 @@ def _check_thresholds(limits: Thresholds, taxels: int) -> None:
     for name, least, most in ranges:
         value = getattr(limits, name)
         if not (value is None and name == "contact") and not least <= value <= most:
-            raise BundleError(
-                f"manifest has {value} for thresholds.{name}, which must be {least:.3g} to "
-                f"{most:.3g}; export the bundle again"
-            )
+            yield f"has {value} for thresholds.{name}, which must be {least:.3g} to {most:.3g}"
 
 
-def _check_parts(manifest: Manifest) -> None:
-    """Parts that need each other are there together. Raises BundleError."""
-    if (manifest.known is not None) != (MEANS in manifest.files):
-        raise BundleError(
-            f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
-        )
-    if manifest.early and manifest.early.limits and not manifest.known:
-        raise BundleError("manifest has `early.limits` without `known`; export the bundle again")
-    if manifest.displacement and not (manifest.known and manifest.contact):
-        raise BundleError(
-            "manifest has `displacement` without `known` and `contact`; export the bundle again"
-        )
-    taxels = manifest.format.rows * manifest.format.cols
-    if manifest.bridging and manifest.bridging.taxels >= taxels:
-        raise BundleError(
-            f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
-            "export the bundle again"
-        )
-    loads = manifest.bridging and manifest.bridging.loads
-    if loads and len(loads.mean) != manifest.format.channels:
-        raise BundleError(
-            f"manifest has {len(loads.mean)} loads in `bridging` for {manifest.format.channels} "
-            "values of a frame; export the bundle again"
-        )
-    if manifest.sliding and len(manifest.sliding.least) > len(manifest.labels):
-        raise BundleError(
-            f"manifest has {len(manifest.sliding.least)} limits in `sliding` for "
-            f"{len(manifest.labels)} labels; export the bundle again"
-        )
-    if manifest.contact and manifest.thresholds.contact is None:
-        raise BundleError(
-            "manifest has `contact` without `thresholds.contact`; export the bundle again"
-        )
+def _wrong_parts(m: Manifest) -> Iterator[str]:
+    """Parts that need each other and are not there together, or do not fit the format."""
+    taxels, channels = m.format.rows * m.format.cols, m.format.channels
+    if (m.known is not None) != (MEANS in m.files):
+        yield f"must have both `known` and {MEANS}, or neither"
+    if m.early and m.early.limits and not m.known:
+        yield "has `early.limits` without `known`"
+    if m.early and m.input != "raw":
+        yield f"has `early`, but input {m.input!r} needs the whole window"
+    if m.displacement and not (m.known and m.contact):
+        yield "has `displacement` without `known` and `contact`"
+    if m.bridging and m.bridging.taxels >= taxels:
+        yield f"bridges {m.bridging.taxels} of {taxels} taxels, which leaves none"
+    loads = m.bridging and m.bridging.loads
+    if loads and len(loads.mean) != channels:
+        yield f"has {len(loads.mean)} loads in `bridging` for {channels} values of a frame"
+    if m.sliding and len(m.sliding.least) > len(m.labels):
+        yield f"has {len(m.sliding.least)} limits in `sliding` for {len(m.labels)} labels"
+    if m.contact and m.thresholds.contact is None:
+        yield "has `contact` without `thresholds.contact`"
 
 
-def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises BundleError for an unknown file, or an entry without sha256 and size."""
+def _wrong_files(files: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """An unknown file, or an entry without sha256 and size."""
     for name, entry in files.items():
         if name not in (MODEL, GOLDEN, MEANS):
-            raise BundleError(
-                f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone"
-            )
+            yield f"names a file {name!r}, and a bundle has {MODEL}, {GOLDEN} and {MEANS} alone"
         hashed, size = entry.get("sha256"), entry.get("bytes")
-        if (
-            entry.keys() != {"sha256", "bytes"}
-            or not isinstance(hashed, str)
-            or not _SHA256.fullmatch(hashed)
-        ):
-            raise BundleError(
-                f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the "
-                "bundle again"
-            )
+        hexadecimal = isinstance(hashed, str) and _SHA256.fullmatch(hashed)
+        if entry.keys() != {"sha256", "bytes"} or not hexadecimal:
+            yield f"has {dict(entry)} for {name}, where sha256 and bytes are wanted"
         if type(size) is not int or not 0 <= size <= MOST_BYTES:
-            raise BundleError(
-                f"manifest gives {name} {size!r} bytes; 0 to {MOST_BYTES} are allowed: export a "
-                "smaller model"
-            )
+            yield f"gives {name} {size!r} bytes, and 0 to {MOST_BYTES} are allowed"
 
 
-def _check_labels(labels: tuple[str, ...]) -> None:
-    """Raises BundleError for fewer than two labels, equal labels, and labels that cannot be
-    sent."""
+def _wrong_names(labels: tuple[str, ...], displays: Mapping[str, str]) -> Iterator[str]:
+    """Fewer than two labels, equal ones and those that cannot be sent; and a display name that
+    cannot be shown, or that belongs to no label."""
     if len(labels) < 2 or len(set(labels)) < len(labels):
-        raise BundleError(
-            f"manifest labels {list(labels)} must be at least two different names; "
-            "export the bundle again"
-        )
+        yield f"labels {list(labels)} must be at least two different names"
     for label in labels:
         if not isinstance(label, str) or not LABEL.fullmatch(label):
-            raise BundleError(
-                f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' "
-                "or '-'"
-            )
-
-
-def _check_displays(displays: Mapping[str, str], labels: tuple[str, ...]) -> None:
-    """Raises BundleError for a display name that cannot be shown, or that belongs to no label."""
+            allowed = "use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+            yield f"label {label!r} cannot be sent: {allowed}"
     for label, text in displays.items():
         if label not in labels:
-            raise BundleError(
-                f"manifest has a display name of {label!r}, which is not a label; export the "
-                "bundle again"
-            )
+            yield f"has a display name of {label!r}, which is not a label"
         if not can_be_shown(text):
-            raise BundleError(
-                f"display name {text!r} of {label!r} cannot be shown; use 1 to {MOST_SHOWN} "
-                "characters that are printed"
-            )
+            allowed = f"use 1 to {MOST_SHOWN} characters that are printed"
+            yield f"display name {text!r} of {label!r} cannot be shown: {allowed}"

@@ -72,8 +72,8 @@ def _instead(name: str, run: str, help: str) -> _Row:
 
 # fmt: off
 OPTIONS: Mapping[str, _Row] = {
-    "sim": ("--sim", "simulated tubes, one of them, a finger at rest on one, or a sweep set, instead"
-        " of the devices", _text("skin[:MATERIAL]|rest|replay:FILE", None)),
+    "sim": ("--sim", "simulated tubes, one of them, a finger at rest on one, or a sweep set,"
+        " instead of the devices", _text("skin[:MATERIAL]|rest|replay:FILE", None)),
     "skin": ("--skin", "profile of the skin, or its file (skin.profile)", _text("NAME", None)),
     "virtual": ("--virtual", "with --sim: do not wait for the time to pass", _FLAG),
     "seed": ("--seed", "seed of the simulated tubes (default 0)", {"type": int, "default": 0}),
@@ -128,7 +128,8 @@ OPTIONS: Mapping[str, _Row] = {
     "use": ("--use", "make a bundle of all sweeps, after those of --label; it runs on trial",
         _FLAG),
     "unknown": ("--unknown", "take kept sweeps (store.black_box) that were answered `unknown, as"
-        " sweep N` as sweeps of --label: those that sweep NUMBER belongs to. Without --label, list them",
+        " sweep N` as sweeps of --label: those that sweep NUMBER belongs to. Without --label,"
+        " list them",
         _count_of("NUMBER", nargs="?", const=0)),
     "forget": ("--forget", "teach the sweeps of this material no longer; they stay",
         _text("NAME", None)),

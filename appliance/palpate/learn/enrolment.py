@@ -136,23 +136,12 @@ def _added(
 ) -> tuple[Bundle, bytes]:
     """`old` with the last label of `classes`, and the enrolment.npz of all enrolled labels.
     called: the label and its name for people."""
-    means, sweeps, spread = classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
-    golden_sweeps = golden[None]
-    label, display = called
-    labels: tuple[str, ...] = (label,)
-    displays: tuple[str, ...] = (display,)
-    if before := old.added:
-        labels, displays = (*before.labels, label), (*before.displays, display)
-        means, spread = np.vstack([before.means, means]), np.append(before.spread, spread)
-        sweeps = np.append(before.sweeps, sweeps)
-        golden_sweeps = np.concatenate([before.golden, golden_sweeps])
-    held = means, sweeps, spread, golden_sweeps, logits, LEAST
-    added = AddedLabels(old.base, labels, *held, displays)
+    (label, display), last = called, slice(-1, None)
+    learnt = classes.means[last], classes.sweeps[last], classes.spread[last]
+    one = AddedLabels(old.base, (label,), *learnt, golden[None], logits, LEAST, (display,))
+    added = old.added.plus(one) if old.added else one
     file = enrolled.file(added)
-    n, wide = int(sweeps[-1]), float(spread[-1])
-    new = enrolled.with_label(old, called, means[-1], n, wide, golden)
-    new = enrolled.deciding(new, LEAST)
-    return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
+    return enrolled.joined(old.before or old, added, bundle.identity(file)), file
 
 
 def _median(scores: NDArray[np.float64]) -> int:

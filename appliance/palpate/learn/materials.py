@@ -92,7 +92,7 @@ def taught(
     """The bundle with these materials. One that was enrolled before is learnt anew, and a forgotten
     one is left out. displays: names for people, by label. Raises BundleError and FormatError as
     `enrolment.enrol`."""
-    new = _without(running, {*windows, *forgotten})
+    new = _without(running.bundle, {*windows, *forgotten})
     warnings, disagreements = list[str](), list[str]()
     made: Enrolment | None = None
     for label, of in windows.items():
@@ -106,24 +106,14 @@ def taught(
     return replace(made, warnings=tuple(warnings), disagreement="; ".join(disagreements))
 
 
-def _without(running: SignedBundle, labels: set[str]) -> Bundle:
+def _without(old: Bundle, labels: set[str]) -> Bundle:
     """The bundle without these enrolled labels."""
-    old = running.bundle
     added = old.added
     if added is None or not labels & {*added.labels}:
         return old
-    new = bundle.from_files(enrolment.original(running.files), old.manifest.name)
     kept = [k for k, label in enumerate(added.labels) if label not in labels]
-    for k in kept:
-        mean, n, spread = added.means[k], int(added.sweeps[k]), float(added.spread[k])
-        called = added.labels[k], added.displays[k]
-        new = enrolled.with_label(new, called, mean, n, spread, added.golden[k])
-    new_lists = {
-        name: getattr(added, name)[kept] for name in ("means", "sweeps", "spread", "golden")
-    }
-    labels_left, shown = (tuple(texts[k] for k in kept) for texts in (added.labels, added.displays))
-    still = replace(added, labels=labels_left, displays=shown, **new_lists)
-    return replace(new, added=still if kept else None)
+    assert old.before
+    return enrolled.joined(old.before, added.only(kept), old.id) if kept else old.before
 
 
 def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
@@ -131,7 +121,7 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
     many = {name: of for name, of in sweeps.windows.items() if len(of) > 1}
     if not many:
         raise BundleError("no new material has two sweeps; record another of it")
-    return left_out(_without(running, {*many}), many, sweeps)
+    return left_out(_without(running.bundle, {*many}), many, sweeps)
 
 
 def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Assessment:
