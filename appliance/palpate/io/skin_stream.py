@@ -233,19 +233,20 @@ class CountedStream:
         """Compare the measured rate with the expected one. Raises SensorMismatch."""
         pace = self._watch.pace
         if pace and abs(pace - 1) > RATE_WANDER:
-            raise SensorMismatch(another_rate(pace * self._format.rate_hz, self._format.rate_hz))
+            measured_hz, wanted_hz = pace * self._format.rate_hz, self._format.rate_hz
+            share = f"{100 * (pace - 1):+.0f} %, at most {100 * RATE_WANDER:g}"
+            raise SensorMismatch(
+                f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected"
+                f" ({share}); set skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
+            )
 
 
 FrameStream = Stream | CountedStream
 
 
-def another_rate(measured_hz: float, wanted_hz: float) -> str:
-    """The sentence about a skin that sends frames at another rate than expected."""
-    share = f"{100 * (measured_hz / wanted_hz - 1):+.0f} %, at most {100 * RATE_WANDER:g}"
-    return (
-        f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected ({share}); "
-        f"set skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
-    )
+def proven_s(format: SweepFormat) -> float:
+    """Time in which a CountedStream sees a wrong rate, in seconds."""
+    return (_STEPS + 2) * max(_STEP_NS / 1e9, _STEP_FRAMES / format.rate_hz)
 
 
 class ArrivalWatch:

@@ -146,16 +146,19 @@ def _listened(
     """The frames of the skin and the share of a core for reading them, in words. Counting begins
     with the first frame, since the start takes more processor time."""
     sensor = skins.sensor(settings, format, devices)
-    clocked = "time" not in skins.profile(settings).lacks
     try:
         first_ns = _first_frame(sensor, devices.clock.now_ns)
         begun_ns, counters, first = spent_ns(), sensor.counters, sensor.counters.frames
-        why, passed_s = _counted(sensor, format, first_ns, devices.clock.now_ns, clocked=clocked)
+        seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
+        if "time" in skins.profile(settings).lacks:  # the sensor needs longer to see a wrong rate
+            from palpate.io import skin_stream  # boxes whose skin has a clock do without it
+
+            seconds = max(seconds, skin_stream.proven_s(format))
+        while (passed_s := (devices.clock.now_ns() - first_ns) / 1e9) < seconds:
+            sensor.read()
         share = (spent_ns() - begun_ns) / max(round(passed_s * 1e9), 1)
         if sensor.trouble:
             raise sensor.trouble
-        if why:
-            raise SensorMismatch(why)
         who = sensor.identity
         name = f"{who.board} {who.serial}" if who else ""
         sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
@@ -176,25 +179,6 @@ def _listened(
         sensor.close()
 
 
-def _counted(
-    sensor: Sensor, format: SweepFormat, first_ns: int, now_ns: Callable[[], int], *, clocked: bool
-) -> tuple[str, float]:
-    """Read frames for a while: why their rate differs, "" if it does not, and the time in seconds.
-    clocked: the skin has a clock, so that the sensor compares the rate."""
-    counters, first = sensor.counters, sensor.counters.frames
-    seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
-    points, why = [(0, first_ns)], ""
-    # a busy machine reads late: a rate that seems wrong is measured for longer
-    while (passed_s := (now_ns() - first_ns) / 1e9) < seconds or (why and passed_s < LONGEST_S):
-        before = counters.frames
-        sensor.read()
-        if counters.frames > before and not clocked:
-            points.append((counters.frames + counters.lost_frames - first, now_ns()))
-        if (now_ns() - first_ns) / 1e9 >= seconds and not clocked:
-            why = _another_rate(points, format.rate_hz)
-    return why, passed_s
-
-
 def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
     """The time of the first frame. Raises SensorError if none comes within LISTEN_S, or within
     BOOT_S from a skin that was opened: its board may boot first."""
@@ -209,25 +193,6 @@ def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
                 f"the skin sent no frame within {BOOT_S} s; replug it"
             )
     return now_ns()
-
-
-def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
-    """Why a skin without a clock sends at another rate than wanted, "" if it does not. points:
-    frames so far, and the time. One frame more or less does not count."""
-    from palpate.io import skin_stream  # boxes whose skin has a clock do without it
-
-    third = len(points) // 3
-    if third < 2:
-        return ""
-    # a frame may be read late, never early: compare the promptest of the first and the last third
-    late = [t_ns - frames * 1e9 / wanted_hz for frames, t_ns in points]
-    first, last = (
-        min(part, key=late.__getitem__) for part in (range(third), range(2 * third, len(points)))
-    )
-    frames, passed_ns = (points[last][i] - points[first][i] for i in (0, 1))
-    measured_hz = frames * 1e9 / max(passed_ns, 1)
-    wrong = abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1)
-    return skin_stream.another_rate(measured_hz, wanted_hz) if wrong else ""
 
 
 def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:

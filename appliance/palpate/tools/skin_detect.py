@@ -14,7 +14,7 @@ from palpate.core.config import SkinConfig
 from palpate.core.errors import FormatError, SensorError
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, skin_codecs, wire_numbers
-from palpate.io.link import BytePort, SkinLink, reply_to
+from palpate.io.link import BytePort, reply_to
 from palpate.io.serial_port import PortInfo
 from palpate.io.serial_sensor import requests, started
 from palpate.io.skin_codecs import Rest
@@ -23,8 +23,6 @@ from palpate.tools import skin_text
 
 LISTEN_S = 2.0
 """Time for each speed of a port: 56 frames of the slowest skin."""
-BOOT_S = 3.0
-"""Additional time for the first byte after a port was opened; many boards boot then."""
 FITS = 0.9
 """Share of the bytes that must be in frames of a profile."""
 FEWEST_FRAMES = 4
@@ -181,23 +179,15 @@ def listen(
 ) -> HeardBytes:
     """The bytes of a port. starter: its commands and requests are written. Raises SensorError."""
     port = open_port(path, baud)
-    with closing(started(port, starter, starter.rate_hz, clock) if starter else port) as link:
-        return HeardBytes(collect(link, clock, seconds))
-
-
-def collect(
-    port: BytePort | SkinLink, clock: Clock, seconds: float, boot_s: float = 0.0
-) -> list[tuple[bytes, int]]:
-    """The reads of an open port within `seconds` of its first byte, with their times. boot_s: time
-    beyond `seconds` in which the first byte may come. Raises SensorError."""
     reads: list[tuple[bytes, int]] = []
-    until_ns = clock.now_ns() + round((seconds + boot_s) * 1e9)
-    while (left_ns := until_ns - clock.now_ns()) > 0:
-        if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
-            if not reads:
-                until_ns = clock.now_ns() + round(seconds * 1e9)
-            reads.append((data, clock.now_ns()))
-    return reads
+    with closing(started(port, starter, starter.rate_hz, clock) if starter else port) as link:
+        until_ns = clock.now_ns() + round(seconds * 1e9)
+        while (left_ns := until_ns - clock.now_ns()) > 0:
+            if data := link.read(1 << 16, max(1, left_ns // 1_000_000)):
+                if not reads:  # a board may boot first
+                    until_ns = clock.now_ns() + round(seconds * 1e9)
+                reads.append((data, clock.now_ns()))
+    return HeardBytes(reads)
 
 
 def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
