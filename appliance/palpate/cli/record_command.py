@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from palpate.cli.common import load_settings
 from palpate.cli.devices import open_devices
-from palpate.cli.reporting import capture, done, feed, status
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
@@ -27,6 +26,7 @@ from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command, Port
 from palpate.runtime import assembly
+from palpate.runtime.reporting import capture, done, feed, status
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SweepCheck
@@ -58,14 +58,14 @@ def run(args: argparse.Namespace) -> int:
         check = SweepCheck(format, devices.clock)
         box = assembly.assembled(
             *(settings, check, devices, port, stack),
-            capture=capture(args, settings, format, stack),
+            capture=capture(args.capture, settings, format, stack),
             observers=[disk, *reports, *pages],
             commands=recording.commands,
             ordered=bool(pages),
         )
         for shown in pages:
             stack.enter_context(shown)
-        box.run(done(args, box, devices, stopped))
+        box.run(done(args.sweeps, box, devices, stopped))
     return stopped.exit_code
 
 

@@ -13,7 +13,6 @@ from palpate.bundle.bundle import DEFAULT, Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.cli.common import load_bundle, load_settings
 from palpate.cli.devices import open_devices
-from palpate.cli.reporting import capture, done, feed, status
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
@@ -25,6 +24,7 @@ from palpate.core.observer import Facts, Observer
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
+from palpate.runtime.reporting import capture, done, feed, status
 from palpate.service import last_failure
 from palpate.service.systemd import Notifier, VerdictLog
 
@@ -67,10 +67,10 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
         }
         reports = _reports(settings, current, devices.source, facts, stack, disk)
         observers = [o for o in (disk, Notifier(SystemClock()), trial, shadow, *reports) if o]
-        recorded = capture(args, settings, current.format, stack)
+        recorded = capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack
         box = assembly.box(*parts, capture=recorded, observers=observers)
-        box.run(done(args, box, devices, stopped))
+        box.run(done(args.sweeps, box, devices, stopped))
     return stopped.exit_code
 
 

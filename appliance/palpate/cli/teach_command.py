@@ -8,13 +8,11 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
 from importlib.util import find_spec
 
 from palpate.cli import record_command
 from palpate.cli.common import load_settings
 from palpate.cli.options import TEACH_PORT
-from palpate.cli.reporting import capture, feed, status
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
@@ -22,7 +20,7 @@ from palpate.core.log import log
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.learn import install, materials
 from palpate.learn.process import News
-from palpate.learn.program import NOTHING, Outputs, TaughtLesson, TeachingProgram
+from palpate.learn.program import NOTHING, TaughtLesson, TeachingProgram
 from palpate.learn.session import refuse_trained
 from palpate.runtime import assembly
 from palpate.sweeps import unknown_sweeps
@@ -48,9 +46,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.labels and args.web is None:
         return _in_json(args, lambda: _assess(args, settings))
     _check_key(settings)
-    lesson = TaughtLesson(
-        args.labels, args.position, args.session, args.good, args.by, _options(args)
-    )
+    taught = args.labels, args.position, args.session, args.good, args.by
+    lesson = TaughtLesson(*taught, _options(args), capture=args.capture)
     if args.web is not None:
         _session(args, without_lines(args, settings), lesson, args.web)
         return 0
@@ -79,7 +76,7 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
         f"{NOTHING}: READY stays low; teach the box on its page, {address} (systemctl start "
         "palpate-teach starts it at once), or by palpate teach; or deploy a bundle"
     )
-    lesson = TaughtLesson(options=_options(args), waits=address)
+    lesson = TaughtLesson(options=_options(args), waits=address, capture=args.capture)
     _session(args, without_lines(args, settings), lesson)
     return 0
 
@@ -116,15 +113,7 @@ def _session(
         pages = record_command.page(web, settings, format, devices, *talk, teaching=True)
         for page in pages:
             stack.enter_context(page)
-        nothing = {"bundle": "", "labels": []}
-        outputs = Outputs(
-            pages,
-            next((page.server.address for page in pages), lesson.waits),
-            partial(status, settings),
-            partial(feed, settings, format, devices.source, nothing),
-            partial(capture, args, settings, format),
-        )
-        program.run(outputs)
+        program.run(pages, next((page.server.address for page in pages), lesson.waits))
 
 
 def _options(args: argparse.Namespace) -> list[str]:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from palpate.answer.slide_check import SlidesAmong
@@ -29,8 +30,8 @@ from palpate.learn.hand_over import HandOver
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box
+from palpate.runtime.reporting import capture, feed, status
 from palpate.service.systemd import Notifier
-from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SweepCheck
 
@@ -46,7 +47,7 @@ class TaughtLesson:
     position, session: of the first sweeps. good: wanted number of sweeps of each material. by: who
     teaches. options: of the settings, for the process that makes a bundle. waits: the address of
     the page to which the service hands over, or the reason why there is none; the service runs even
-    if nothing can start a sweep. "" outside of the service.
+    if nothing can start a sweep. "" outside of the service. capture: file of all input, or None.
     """
 
     labels: Sequence[str] = ()
@@ -56,18 +57,7 @@ class TaughtLesson:
     by: str = ""
     options: Sequence[str] = ()
     waits: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """The outputs of the program. pages: at `address`. status, feed: the observers that publish
-    facts. capture: opens the capture of a recording."""
-
-    pages: Sequence[Observer]
-    address: str
-    status: Callable[[Facts], list[Observer]]
-    feed: Callable[[Facts], list[Observer]]
-    capture: Callable[[ExitStack], CaptureWriter | None]
+    capture: Path | None = None
 
 
 class TeachingProgram:
@@ -107,10 +97,10 @@ class TeachingProgram:
         """Carry out an order of the page, in the loop's thread."""
         return self._phase.obey(command)
 
-    def run(self, outputs: Outputs) -> None:
-        """Run until all sweeps are recorded; with a page until DONE."""
-        self.outputs = outputs
-        while self._ran(RecordingPhase) and outputs.pages and not self.ended:
+    def run(self, pages: Sequence[Observer], address: str) -> None:
+        """Run until all sweeps are recorded; with pages, at `address`, until DONE."""
+        self.pages, self.address = pages, address
+        while self._ran(RecordingPhase) and pages and not self.ended:
             if not self._ran(TryingPhase):
                 return
 
@@ -150,7 +140,7 @@ class RecordingPhase(Phase):
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
         self._program, lesson, devices = program, program.lesson, program.devices
-        settings, again, outputs = program.settings, program.again, program.outputs
+        settings, again, pages = program.settings, program.again, program.pages
         port, disk = program.port(), DiskThread()
         say = port.say if port else lambda line: None
         labels = Labels(again, lesson.position, lesson.session)
@@ -166,14 +156,14 @@ class RecordingPhase(Phase):
         check = SweepCheck(program.format, devices.clock, slides)
         self.box = assembly.assembled(
             *(settings, check, devices, port, stack),
-            capture=outputs.capture(stack),
-            observers=[disk, *self._observers(), self._teacher, *outputs.pages],
+            capture=capture(lesson.capture, settings, program.format, stack),
+            observers=[disk, *self._observers(), self._teacher, *pages],
             commands=program.by_robot({**session.recording_commands, **session.commands}),
-            ordered=bool(outputs.pages or lesson.waits),
+            ordered=bool(pages or lesson.waits),
             serving=False,
         )
         self.orders = {**session.recording_commands, **session.commands, "DONE": program.finish}
-        session.by = "the page" if outputs.pages else lesson.by or getpass.getuser()
+        session.by = "the page" if pages else lesson.by or getpass.getuser()
 
     def about(self) -> dict[str, Any]:
         return self._recording.about() | {"teach": self._session.about()}
@@ -208,21 +198,22 @@ class RecordingPhase(Phase):
         return session
 
     def _observers(self) -> list[Observer]:
-        outputs, waits = self._program.outputs, self._program.lesson.waits
+        program, waits = self._program, self._program.lesson.waits
+        settings, nothing = program.settings, {"bundle": "", "labels": []}
         facts: Facts = {
             "model": lambda: NOTHING,
             "recorded": lambda: self._recording.about()["missing"],
             "teach": self._session.about,
-            "page": lambda: outputs.address,
+            "page": lambda: program.address,
         }
-        runtime = self._program.settings.store.runtime_folder if waits.startswith("http") else None
+        runtime = settings.store.runtime_folder if waits.startswith("http") else None
         return [
             Notifier(SystemClock(), note=f"; {NOTHING}: {waits}" if waits else ""),
             *([HandOver(runtime, SystemClock())] if runtime else []),
             self._recording,
             self._session,
-            *outputs.status(facts),
-            *outputs.feed(facts),
+            *status(settings, facts),
+            *feed(settings, program.format, program.devices.source, nothing, facts),
         ]
 
 
@@ -231,7 +222,7 @@ class TryingPhase(Phase):
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
         program.again = ""
-        self._program, settings, outputs = program, program.settings, program.outputs
+        self._program, settings = program, program.settings
         choice = assembly.store(settings).choose()
         trial, disk = [stack.enter_context(choice.trial)] if choice.trial else [], DiskThread()
         for one in trial:
@@ -240,12 +231,12 @@ class TryingPhase(Phase):
         facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
         again = {"TEACH": self._teach_again}
         self.orders = {**again, "DONE": program.finish}
-        reports = *trial, *outputs.status(facts), *outputs.pages
+        reports = *trial, *status(settings, facts), *program.pages
         self.box = assembly.box(
             *(settings, choice.bundle, program.devices, program.port(), stack),
             observers=[disk, Notifier(SystemClock()), *reports],
             commands=program.by_robot(again),
-            ordered=bool(outputs.pages),
+            ordered=bool(program.pages),
         )
 
     def about(self) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def test_a_box_without_lines_waits_to_be_taught(board, mode, monkeypatch):
     monkeypatch.setattr(
         teach_command.TeachingProgram,
         "run",
-        lambda self, outputs: modes.append(self.settings.trigger.mode),
+        lambda self, *_: modes.append(self.settings.trigger.mode),
     )
     args = arguments("run", ["--skin", "flexitac", *board])
     assert teach_command.until_taught(args, load_settings(args)) == 0

@@ -28,7 +28,6 @@ from palpate.inference.classifier import Classifier
 from palpate.io.robot_link import command
 from palpate.learn import enrolment, install, materials
 from palpate.learn.program import (
-    Outputs,
     RecordingPhase,
     TaughtLesson,
     TeachingProgram,
@@ -330,7 +329,7 @@ def test_a_trained_material_is_refused_before_a_sweep(box, capsys):
     settings = replace(box.settings, trigger=replace(box.settings.trigger, mode="serial"))
     format, page = box.running.bundle.format, (Observer(),)
     program = TeachingProgram(settings, Devices(SystemClock()), format, TaughtLesson())
-    program.outputs = Outputs(page, "", lambda facts: [], lambda facts: [], lambda stack: None)
+    program.pages, program.address = page, ""
     with ExitStack() as stack:
         phase = TryingPhase(program, stack)
         with pytest.raises(ConfigError, match="'foam'"):
@@ -346,7 +345,7 @@ def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
     settings = replace(settings, teach=replace(teach, serial=allowed))
     devices = Devices(SystemClock())
     program = TeachingProgram(settings, devices, skin.FORMAT, TaughtLesson(waits="no page"))
-    program.outputs = Outputs((), "", lambda facts: [], lambda facts: [], lambda stack: None)
+    program.pages, program.address = (), ""
     orders = (("MATERIAL", "felt"), ("POSITION", "2"), ("SESSION", "b"), ("NEXT", ""))
     with ExitStack() as stack:
         phase = RecordingPhase(program, stack)

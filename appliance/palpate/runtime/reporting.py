@@ -1,12 +1,12 @@
-"""Parts that `run` and `record` share: status file, feed, capture, and the end of the loop."""
+"""What every running box reports: status file, feed, capture; and the end of its loop."""
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
@@ -14,31 +14,27 @@ from palpate.core.devices import Devices
 from palpate.core.observer import Facts, Observer
 from palpate.core.types import SweepFormat
 from palpate.io import skins
+from palpate.runtime.loop import Box
 from palpate.service.status_file import StatusFile
 from palpate.sweeps.capture import CaptureWriter
 
-if TYPE_CHECKING:
-    from palpate.runtime.loop import Box
-
 
 def capture(
-    args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
+    path: Path | None, settings: Config, format: SweepFormat, stack: ExitStack
 ) -> CaptureWriter | None:
-    capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
-    if capture:
-        stack.callback(capture.close)
-    return capture
+    """The capture of `--capture`, which `stack` closes."""
+    made = CaptureWriter(path, format, skins.profile(settings)) if path else None
+    if made:
+        stack.callback(made.close)
+    return made
 
 
 def done(
-    args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
+    wanted: int | None, box: Box, devices: Devices, stopped: Callable[[], bool]
 ) -> Callable[[], bool]:
-    """True after a signal, after `--sweeps` answers, and at the end of a script."""
-    wanted = args.sweeps
-    done = devices.finished
-    return lambda: (
-        (wanted is not None and box.answered >= wanted) or stopped() or done(box.answered)
-    )
+    """True after a signal, after `wanted` answers, and at the end of a script."""
+    most = float("inf") if wanted is None else wanted
+    return lambda: box.answered >= most or stopped() or devices.finished(box.answered)
 
 
 def status(settings: Config, facts: Facts) -> list[Observer]:
