@@ -118,14 +118,10 @@ def run_install(args: argparse.Namespace) -> int:
     if not args.shadow:
         committed = store.state.of(sha).committed
         how = "it is committed already" if committed else f"it runs on trial {NEXT}"
-    print(f"bundle {sha[:8]} is installed; {how}{_elsewhere(settings)}")
+    if settings.classifier.bundle:
+        how += "; it does not run while the settings name another bundle: classifier.bundle"
+    print(f"bundle {sha[:8]} is installed; {how}")
     return 0
-
-
-def _elsewhere(settings: Config) -> str:
-    """Whether the settings name another bundle than that of the store, as the end of a message."""
-    named = "; it does not run while the settings name another bundle: classifier.bundle"
-    return named if settings.classifier.bundle else ""
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:

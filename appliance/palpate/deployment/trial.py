@@ -100,7 +100,8 @@ class Trial(Observer):
     ) -> None:
         """Count this start against the bundle, unless a signal or an error of hardware or settings
         ended the program."""
-        if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
+        of_others = isinstance(error, ApplianceError) and not isinstance(error, BundleError)
+        if kind is None or not issubclass(kind, Exception) or of_others:
             self.stopping()
 
     def _record(self, health: Health) -> None:
@@ -111,7 +112,8 @@ class Trial(Observer):
                 self._write(health, self._commit, self._end)
         elif counted != self._counted or self._stale:
             self._stale = False
-            self._write(health, self._note(counted), lambda: self._set_counted(counted))
+            note = self._note(counted)
+            self._write(health, note, partial(setattr, self, "_counted", counted))
 
     def _write(self, health: Health, act: Callable[[], object], done: Callable[[], object]) -> None:
         """Write to the store; `done` follows a success, another attempt a failure."""
@@ -132,9 +134,6 @@ class Trial(Observer):
         starts, s = self._starts - (not counts), self._streamed_ns / 1e9
         return partial(self._store.note, self._sha, starts, counts, self._sweeps, s)
 
-    def _set_counted(self, counted: bool) -> None:
-        self._counted = counted
-
     def _commit(self) -> None:
         self._done = self._store.commit(self._sha, 0.0)
 
@@ -142,7 +141,3 @@ class Trial(Observer):
         self._over = True
         if self._done:
             log.info(f"bundle {self._sha[:8]} has passed its trial and is committed")
-
-
-def _is_hardware_or_settings(error: BaseException | None) -> bool:
-    return isinstance(error, ApplianceError) and not isinstance(error, BundleError)

@@ -61,7 +61,11 @@ def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial)
     `is_held` tells whether another program has it."""
     port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
     try:
-        _keep_others_out(port.fileno())
+        # The kernel refuses any further open, except by root: another reader would take bytes away,
+        # and a lock only binds programs that check it. A pseudo-terminal would stay locked, also
+        # for us, if we were killed while its other end is open.
+        if os.major(os.fstat(port.fileno()).st_rdev) not in PSEUDO_TERMINALS:
+            fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
     except OSError:
         port.close()
         raise
@@ -81,11 +85,3 @@ def close(port: Any) -> None:
 def is_held(e: Exception) -> bool:
     """Whether a port could not be opened because another program has it."""
     return getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
-
-
-def _keep_others_out(port: int) -> None:
-    """Make the kernel refuse any further open of `port`, except by root. Another reader would take
-    bytes away, and a lock only binds programs that check it. Pseudo-terminals are left out: if we
-    were killed while the other end is open, it would stay locked, also for us."""
-    if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
-        fcntl.ioctl(port, termios.TIOCEXCL)

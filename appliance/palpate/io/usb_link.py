@@ -70,7 +70,9 @@ class VendorLink:
         self._device, self._number, self._clock = device, interface.bInterfaceNumber, clock
         self._in = _endpoint(interface, usb.util.ENDPOINT_IN)
         for number in self._claimed():
-            _claim(device, number)
+            if device.is_kernel_driver_active(number):
+                device.detach_kernel_driver(number)
+            usb.util.claim_interface(device, number)
 
     def _claimed(self) -> list[int]:
         return [self._number]
@@ -209,12 +211,6 @@ def _endpoint(interface: Any, direction: int) -> int:
         which = "IN" if direction else "OUT"
         raise SensorMismatch(f"the skin has no bulk endpoint {which}; check its firmware")
     return int(endpoint.bEndpointAddress)
-
-
-def _claim(device: usb.core.Device, number: int) -> None:
-    if device.is_kernel_driver_active(number):
-        device.detach_kernel_driver(number)
-    usb.util.claim_interface(device, number)
 
 
 @contextlib.contextmanager

@@ -62,7 +62,9 @@ def check(
     yield _try(
         "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
     )
-    yield from _wiring(settings, devices)
+    yield from _triggered(settings, devices)
+    if settings.serial.port:
+        yield _try("serial port", lambda: _port(settings, devices))
 
 
 def _of_bundle(
@@ -96,13 +98,6 @@ def _of_bundle(
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
-
-
-def _wiring(settings: Config, devices: Devices) -> Iterator[CheckResult]:
-    """Trigger, GPIO lines and serial port."""
-    yield from _triggered(settings, devices)
-    if settings.serial.port:
-        yield _try("serial port", lambda: _port(settings, devices))
 
 
 def _try(component: str, look: Callable[[], str]) -> CheckResult:

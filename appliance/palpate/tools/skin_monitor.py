@@ -136,7 +136,8 @@ class SkinMonitor:
         self._full = max(self._full, float(load.max()))
         passed_ns = int(self._t_ns[-1] - self._t_ns[0])
         noise = self._noise()
-        stuck, dead = self._stuck(), self._dead(noise)
+        stuck = np.asarray(self._t_ns[-1] - self._changed_ns >= STUCK_S * 1e9)
+        dead = self._dead(noise)
         return {
             "load": _nested(load),
             "full": self._full,
@@ -151,9 +152,6 @@ class SkinMonitor:
         """Standard deviation [R, C, A] of the signal's fast part: half the mean square of
         neighbours' differences (von Neumann 1941), which a slow touch does not raise."""
         return np.asarray(np.sqrt((np.diff(self._taxels, axis=0) ** 2).mean(axis=0) / 2))
-
-    def _stuck(self) -> NDArray[np.bool_]:
-        return np.asarray(self._t_ns[-1] - self._changed_ns >= STUCK_S * 1e9)
 
     def _dead(self, noise: NDArray[np.float64]) -> NDArray[np.bool_]:
         moved, middle = self._highest - self._lowest, (0, 1)
