@@ -1,11 +1,14 @@
-"""The View, the picture of `palpate skin align` at one moment, and its displays' interface."""
+"""The View, the picture of `palpate skin align` at one moment; its displays' interface; and the
+display that prints a line a second."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TextIO, TypeVar
 
 from palpate.answer.contact import ContactPositions, Point
+from palpate.core.clock import Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,3 +69,29 @@ class Display(Protocol[Shown]):
 
     def show(self, view: Shown) -> None:
         """Show `view` instead of the view before."""
+
+
+LINE_NS = 1_000_000_000
+"""Time between two lines."""
+
+
+class LinePrinter(Generic[Shown]):
+    """Prints what it is shown on `out`, at most once a second. line: makes the line."""
+
+    def __init__(self, out: TextIO, clock: Clock, line: Callable[[Shown], str]) -> None:
+        self._out, self._clock, self._line = out, clock, line
+        self._next_ns = 0
+
+    def show(self, view: Shown) -> None:
+        """Print `view`, unless a line was printed within the last second."""
+        if (now_ns := self._clock.now_ns()) >= self._next_ns:
+            self._next_ns = now_ns + LINE_NS
+            print(self._line(view), file=self._out, flush=True)
+
+
+def line(view: View) -> str:
+    """A View in one line that begins with the message."""
+    at = ""
+    if view.centre is not None:
+        at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}"
+    return f"{view.origin and f'{view.origin}  '}{view.message}{at}  ({view.hint})"

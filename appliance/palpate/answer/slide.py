@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal, Slide
 from palpate.answer.window import TINY, Counts, Waves, Window
-from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import BundleError
+from palpate.core.sentences import DIRECTIONS
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, SweepFormat
 

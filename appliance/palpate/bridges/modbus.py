@@ -23,10 +23,9 @@ from palpate.bridges.server import TcpPeer
 from palpate.bridges.source import BoxView, Source
 from palpate.client.answers import Answer
 from palpate.core.clock import Clock
-from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.log import SparseLog
-from palpate.core.sentences import MOST_FINGERS
+from palpate.core.sentences import DIRECTIONS, MOST_FINGERS
 from palpate.core.status import WORDS, Status
 
 VERSION = 1

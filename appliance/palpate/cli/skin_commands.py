@@ -181,7 +181,7 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 def run_show(args: argparse.Namespace) -> int:
     """Show the skin live, a line a second and on a page, until Ctrl-C."""
     from palpate.alignment import live
-    from palpate.alignment.lines import LinePrinter
+    from palpate.alignment.view import LinePrinter
     from palpate.tools import skin_monitor
 
     devices = open_devices(args, None)
@@ -203,7 +203,7 @@ def run_show(args: argparse.Namespace) -> int:
 def run_align(args: argparse.Namespace) -> int:
     """Show where the contact lies, until Ctrl-C."""
     from palpate.alignment import live
-    from palpate.alignment.lines import LinePrinter, line
+    from palpate.alignment.view import LinePrinter, line
 
     if args.sim == "skin":  # a sweep lifts the finger for a tenth of a second; here it rests
         args.sim = "rest"

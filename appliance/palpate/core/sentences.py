@@ -143,3 +143,7 @@ def read(line: bytes) -> Sentence:
     if given and given.upper() != checksum(body):
         return Sentence(kind, error=f"checksum {given} should be {checksum(body)}")
     return Sentence(kind, text, bool(given))
+
+
+DIRECTIONS = ("rows+", "rows-", "cols+", "cols-")
+"""Towards higher or lower rows or columns."""

@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from palpate.answer.slide_check import SlidesAmong
-from palpate.core.clock import SystemClock
+from palpate.core import storage
+from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ApplianceError
+from palpate.core.health import Health
 from palpate.core.interrupts import StopFlag
+from palpate.core.log import log
 from palpate.core.names import TypedNames
 from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import CommandHandler, Reply
@@ -26,7 +29,6 @@ from palpate.io.robot_link import Command, Port
 from palpate.io.verdict_lines import check_bits
 from palpate.learn import install, materials
 from palpate.learn.enrolment import slide_check
-from palpate.learn.hand_over import HandOver
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box
@@ -265,3 +267,28 @@ class TryingPhase(Phase):
 
 def _forbidden(_: str) -> list[object]:
     raise ApplianceError("the robot may not teach this box; set teach.serial = true to allow it")
+
+
+FILE = "untaught"
+"""In the folder of the status file; the unit names it."""
+AFTER_NS = 20_000_000_000
+"""Time until then. An installation or a delivery waits up to 10 s to see the service run; its end
+for the sake of the page would look like a failure."""
+
+
+class HandOver(Observer):
+    """Writes the file in `folder` once, between two sweeps. clock: the real clock."""
+
+    def __init__(self, folder: Path, clock: Clock) -> None:
+        self._path, self._clock = folder / FILE, clock
+        self._at_ns: int | None = clock.now_ns() + AFTER_NS
+
+    def turn(self, health: Health) -> None:
+        """Write it if it is time. A failure is logged: the robot can teach the box all the same."""
+        if self._at_ns is None or health.sweeping or self._clock.now_ns() < self._at_ns:
+            return
+        self._at_ns = None
+        try:
+            storage.put(self._path, b"")
+        except OSError as e:
+            log.warning(f"teach: no page by itself: {self._path}: {e.strerror}")

@@ -12,8 +12,8 @@ from palpate.cli import teach_command
 from palpate.cli.common import load_settings
 from palpate.cli.parser import arguments
 from palpate.core.health import Health
-from palpate.learn import hand_over, process
-from palpate.learn.hand_over import FILE, HandOver
+from palpate.learn import process, program
+from palpate.learn.program import FILE, HandOver
 from palpate.sim.rig import VirtualClock
 from tests.factories.feeds import HEALTH
 from tests.factories.paths import ROOT
@@ -26,7 +26,7 @@ def test_the_file_comes_once_between_two_sweeps(tmp_path):
     sweeping: Health = HEALTH._replace(sweeping=True)
     one.turn(quiet)
     assert not (tmp_path / FILE).exists()
-    clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
+    clock.sleep_until(clock.now_ns() + program.AFTER_NS)
     one.turn(sweeping)
     assert not (tmp_path / FILE).exists()
     one.turn(quiet)
@@ -40,7 +40,7 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path, logged):
     """It is said once."""
     clock = VirtualClock()
     one = HandOver(tmp_path / "nowhere", clock)
-    clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
+    clock.sleep_until(clock.now_ns() + program.AFTER_NS)
     for _ in range(2):
         one.turn(HEALTH._replace(sweeping=False))
     assert len(logged) == 1
