@@ -109,7 +109,7 @@ def outside() -> Models:
         tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
         if place:
             tensor.external_data.add(key="location", value=place)
-        words = "tensor: external_data" if place else "data_location"
+        words = "tensor: field 13" if place else "tensor: field 14"
         found[f"external data {how}"] = one("Add", "x w", {"w": tensor}), words
     return found
 
@@ -126,8 +126,11 @@ def foreign() -> Models:
         "other operator of onnxruntime": (one("Gelu", domain="com.microsoft"), "'Gelu'"),
         "old operators": (model(relu, opsets=[("", 7)]), "domain '', version 7"),
         "operators twice": (model(relu, opsets=[("", 17), ("", 18)]), "each once"),
-        "function": (changed(model(relu), lambda m: m.functions.append(function)), "functions"),
-        "training": (changed(model(relu), lambda m: m.training_info.add()), "training_info"),
+        "function": (
+            changed(model(relu), lambda m: m.functions.append(function)),
+            "model: field",
+        ),
+        "training": (changed(model(relu), lambda m: m.training_info.add()), "model: field 20"),
         "settings for onnxruntime": (
             changed(model(relu), lambda m: m.metadata_props.add(**setting)),
             "metadata 'ort_config'",
@@ -139,7 +142,7 @@ def endless() -> Models:
     """Models with control flow. onnxruntime opens the loop that waits for a sweep and runs golden
     sweeps; the first sweep with a count of 255 never ends."""
     true = helper.make_tensor("go", TensorProto.BOOL, [], [True])
-    goes_on, inside = node("Identity", ["c"], ["d"]), "graph in the graph"
+    goes_on, inside = node("Identity", ["c"], ["d"]), "attribute: field 6"
     i, c, d = info("i", 7, []), info("c", 9, []), info("d", 9, [])
     body = helper.make_graph([goes_on], "body", [i, c], [d])
     branch = helper.make_graph([node("Relu", ["x"], ["z"])], "branch", [], [info("z", 1, None)])
@@ -244,7 +247,7 @@ def crooked() -> Models:
         "left out": (model([node("Clip", ["x", "", ""], ["y"])]), "''"),
         "no outputs": (model([node("Relu", ["x"], [])], last="x"), "0 outputs"),
         "constant twice": (twice, "is there twice"),
-        "sparse constant": (sparse, "sparse_initializer"),
+        "sparse constant": (sparse, "graph: field 15"),
         "no nodes": (empty, "the output 'logits'"),
         "nothing": (b"", "IR version 0"),
     }
@@ -337,7 +340,7 @@ def misfits() -> Models:
     weights = {"w": np.ones((96, 2), np.float32)}
     of_type = setting(lambda a: setattr(a[0], "type", AttributeProto.FLOAT))
     return {
-        "texts": (one("Add", "x w", {"w": texts}), "tensor: texts"),
+        "texts": (one("Add", "x w", {"w": texts}), "tensor: field 6"),
         "64 bits": (one("Add", "x w", {"w": np.ones(1)}), "type 11"),
         "cast to texts": (one("Cast", to=8), "type 8"),
         "too few floats": (one("Add", "x w", {"w": off}), TRIED),
@@ -382,13 +385,13 @@ def shapes() -> Models:
     listed = input_(lambda t: setattr(t.sequence_type.elem_type.tensor_type, "elem_type", 1))
     maybe = input_(lambda t: setattr(t.optional_type.elem_type.tensor_type, "elem_type", 1))
     return {
-        "named size": (named, "a name instead of"),
+        "named size": (named, "dimension: field 2"),
         "other sweep": (fewer, "the manifest has uint8"),
         "two inputs": (graph(lambda g: g.input.append(info("more", 1, [1]))), "2 inputs"),
         "other logits than declared": (graph(logits), r"\[1, 3\] instead of"),
         "another output": (graph(lambda g: g.output.append(info("x", 1, SWEEP))), "allows logits"),
-        "sequence": (listed, "a sequence"),
-        "optional": (maybe, "an optional type"),
+        "sequence": (listed, "type: field 4"),
+        "optional": (maybe, "type: field 9"),
         "no type": (input_(lambda t: t.Clear()), "no type and shape"),
         "no size": (no_size, "must be a number"),
         "logits of three dimensions": (changed(one("Relu"), three), r"\[1, 1, 1\] instead"),
@@ -418,7 +421,7 @@ def broken() -> Models:
         "a float that ends early": (half, "a number is cut off"),
         "floats that are none": (part(7, part(5, part(4, b"\0" * 5))), "5 bytes are no"),
         "a version of 64 bits": (part(1, 8 + 2**32) + good[2:], "not a code or version"),
-        "a thousand deep": (part(7, deep), "a graph in the graph"),
+        "a thousand deep": (part(7, deep), "attribute: field 6"),
         "brackets": (b"[" * 5000, "model: field 11"),
         "a name of no letters": (good.replace(b"Relu", b"\xff\xfe\xfd\xfc"), "UTF-8"),
     }

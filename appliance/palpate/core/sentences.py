@@ -27,6 +27,8 @@ CommandHandler = Callable[[str], Reply]
 refusal."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 """Characters that no field may contain."""
+DIRECTIONS = ("rows+", "rows-", "cols+", "cols-")
+"""In which a finger slides: towards higher or lower rows or columns."""
 _PATTERN = re.compile(
     rb"(?s:.*\$)?(?P<body>PPLP[, ](?P<kind>[A-Za-z]{0,16})(?:[, ](?P<text>[ "
     rb"-#%-)+-~]*))?)(?:\*(?P<sum>[0-9A-Fa-f]{2}))?"
@@ -143,7 +145,3 @@ def read(line: bytes) -> Sentence:
     if given and given.upper() != checksum(body):
         return Sentence(kind, error=f"checksum {given} should be {checksum(body)}")
     return Sentence(kind, text, bool(given))
-
-
-DIRECTIONS = ("rows+", "rows-", "cols+", "cols-")
-"""Towards higher or lower rows or columns."""

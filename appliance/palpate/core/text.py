@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
 from io import TextIOWrapper
-from typing import TextIO
+
+TYPE_CHECKING = False  # `palpate status` starts sooner without typing
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import TextIO
 
 
 def replace_unprintable() -> None:

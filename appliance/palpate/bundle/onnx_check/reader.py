@@ -24,85 +24,36 @@ library makes 1 GB of 20 MB of empty nodes. MiniRocket, our largest graph, has a
 weights counts once."""
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5
 """Wire types of protobuf that are in use. Not used: 1 (eight bytes), 3 and 4 (groups)."""
-REFUSED = "refused"
-"""Marks a field in FIELDS whose name the error message gives. A field that is not in FIELDS is
-refused, too."""
-FIELDS: dict[str, dict[int, tuple[str, str]]] = {
-    "model": {
-        1: ("ir_version", "code"),
-        2: ("producer_name", "text"),
-        3: ("producer_version", "text"),
-        7: ("graph", "graph"),
-        8: ("opset_import", "opset*"),
-        14: ("metadata_props", "entry*"),
-        20: ("training_info", REFUSED),
-        25: ("functions", REFUSED),
-    },
-    "opset": {1: ("domain", "text"), 2: ("version", "code")},
-    "entry": {1: ("key", "text"), 2: ("value", "text")},
-    "graph": {
-        1: ("node", "node*"),
-        2: ("name", "text"),
-        5: ("initializer", "tensor*"),
-        11: ("input", "declared*"),
-        12: ("output", "declared*"),
-        13: ("value_info", "declared*"),
-        15: ("sparse_initializer", REFUSED),
-    },
-    "node": {
-        1: ("input", "text*"),
-        2: ("output", "text*"),
-        3: ("name", "text"),
-        4: ("op_type", "text"),
-        5: ("attribute", "attribute*"),
-        7: ("domain", "text"),
-    },
-    "attribute": {
-        1: ("name", "text"),
-        2: ("f", "float"),
-        3: ("i", "signed"),
-        4: ("s", "bytes"),
-        5: ("t", "tensor"),
-        6: ("a graph in the graph", REFUSED),
-        7: ("floats", "floats"),
-        8: ("ints", "signed*"),
-        9: ("texts", REFUSED),
-        10: ("tensors", REFUSED),
-        11: ("graphs in the graph", REFUSED),
-        20: ("type", "code"),
-        22: ("a sparse tensor", REFUSED),
-    },
-    "tensor": {
-        1: ("dims", "signed*"),
-        2: ("data_type", "code"),
-        4: ("float_data", "floats"),
-        5: ("int32_data", "signed*"),
-        6: ("texts", REFUSED),
-        7: ("int64_data", "signed*"),
-        8: ("name", "text"),
-        9: ("raw_data", "bytes"),
-        10: ("numbers of 64 bits", REFUSED),
-        13: ("external_data", REFUSED),
-        14: ("data_location", REFUSED),
-    },
-    "declared": {1: ("name", "text"), 2: ("type", "type")},
-    "type": {
-        1: ("tensor_type", "tensortype"),
-        4: ("a sequence", REFUSED),
-        5: ("a map", REFUSED),
-        8: ("a sparse tensor", REFUSED),
-        9: ("an optional type", REFUSED),
-    },
-    "tensortype": {1: ("elem_type", "code"), 2: ("shape", "shape")},
-    "shape": {1: ("dim", "dimension*")},
-    "dimension": {1: ("dim_value", "signed"), 2: ("a name instead of a number", REFUSED)},
+_PROTO = {
+    "model": "1 ir_version code, 2 producer_name text, 3 producer_version text, 7 graph graph,"
+    " 8 opset_import opset*, 14 metadata_props entry*",
+    "opset": "1 domain text, 2 version code",
+    "entry": "1 key text, 2 value text",
+    "graph": "1 node node*, 2 name text, 5 initializer tensor*, 11 input declared*,"
+    " 12 output declared*, 13 value_info declared*",
+    "node": "1 input text*, 2 output text*, 3 name text, 4 op_type text, 5 attribute attribute*,"
+    " 7 domain text",
+    "attribute": "1 name text, 2 f float, 3 i signed, 4 s bytes, 5 t tensor, 7 floats floats,"
+    " 8 ints signed*, 20 type code",
+    "tensor": "1 dims signed*, 2 data_type code, 4 float_data floats, 5 int32_data signed*,"
+    " 7 int64_data signed*, 8 name text, 9 raw_data bytes",
+    "declared": "1 name text, 2 type type",
+    "type": "1 tensor_type tensortype",
+    "tensortype": "1 elem_type code, 2 shape shape",
+    "shape": "1 dim dimension*",
+    "dimension": "1 dim_value signed",
 }
-"""Name and content of each field, by message and number; * marks repeated fields. No message
-contains a message of its own kind, so the depth is limited."""
+FIELDS: dict[str, dict[int, tuple[str, str]]] = {
+    kind: {int(n): (name, holds) for n, name, holds in map(str.split, text.split(", "))}
+    for kind, text in _PROTO.items()
+}
+"""Name and content of each field, by message and number; * marks repeated fields. Any other field
+is refused: functions, training, data in other files, graphs in a graph. No message contains a
+message of its own kind, so the depth is limited."""
 
 
 class Message(SimpleNamespace):
-    """One message: an attribute for each of its FIELDS that is not REFUSED.
+    """One message: an attribute for each of its FIELDS.
 
     A field that the file leaves out is 0 (code), "" (text), () (with *) or else None. Floats are
     float32 [n], bytes a memoryview.
@@ -134,11 +85,8 @@ def fields(message: bytes) -> Iterator[tuple[int, slice, slice]]:
 def _absent(kind: str) -> dict[str, Any]:
     """The values of fields that a message leaves out, by name."""
     usual: dict[str, Any] = {"code": 0, "text": ""}
-    fields = FIELDS[kind].values()
     return {
-        name: () if holds[-1] == "*" else usual.get(holds)
-        for name, holds in fields
-        if holds != REFUSED
+        name: () if holds[-1] == "*" else usual.get(holds) for name, holds in FIELDS[kind].values()
     }
 
 
@@ -155,9 +103,10 @@ class _Reader:
         while at < end:
             begin = at
             tag, at = self.varint(at, end)
-            name, holds = fields.get(tag >> 3, (f"field {tag >> 3}", REFUSED))
-            if holds == REFUSED:
-                raise _wrong(begin, f"{kind}: {name}, which no model of a bundle may have")
+            if tag >> 3 not in fields:
+                what = f"{kind}: field {tag >> 3}, which no model of a bundle may have"
+                raise _wrong(begin, what)
+            name, holds = fields[tag >> 3]
             if holds[-1] == "*":
                 values, at = self._values(holds[:-1], tag, at, end)
                 found.setdefault(name, []).extend(values)
