@@ -55,25 +55,11 @@ def simulated(
     clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
-    if profile.codec == "palpate":
-        acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
-        acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
-        return devices.build(format, acts, clock, source, remember=remember, follows=follows)
-    return emulated(name, format, args, settings, clock, remember=remember, spread=spread)
-
-
-def emulated(
-    name: str,
-    format: SweepFormat | None,
-    args: argparse.Namespace,
-    settings: Config,
-    clock: Clock,
-    *,
-    remember: bool,
-    spread: bool,
-) -> RobotDevices:
-    """Where tests put emulators of makers' skins. Raises ConfigError: the box has none."""
-    raise ConfigError(
-        f'--sim plays a readout board, not the skin "{settings.skin.profile}"; leave --skin out, or'
-        " connect this skin"
-    )
+    if profile.codec != "palpate":  # tests replace this function to play emulators of such skins
+        raise ConfigError(
+            f'--sim plays a readout board, not the skin "{settings.skin.profile}"; leave --skin'
+            " out, or connect this skin"
+        )
+    acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
+    acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
+    return devices.build(format, acts, clock, source, remember=remember, follows=follows)

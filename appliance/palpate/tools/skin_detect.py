@@ -92,12 +92,11 @@ def detect(
     clock: Clock,
     *,
     write: bool = False,
-    seconds: float = LISTEN_S,
 ) -> Iterator[PortFinding]:
     """The skins on the ports. write: also ask, and send start commands."""
     for port in ports:
         try:
-            yield from _on_port(port, profiles, open_port, clock, write, seconds)
+            yield from _on_port(port, profiles, open_port, clock, write)
         except SensorError as e:
             yield PortFinding(port, "", str(e))
 
@@ -116,7 +115,6 @@ def _on_port(
     open_port: OpenPort,
     clock: Clock,
     write: bool,
-    seconds: float,
 ) -> Iterator[PortFinding]:
     by_ids = [name for name, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
     known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
@@ -132,7 +130,7 @@ def _on_port(
             *(n for n in these if write and (these[n].start or requests(these[n]))),
         ]:
             by = these[starter] if starter else None
-            heard[baud] = listen(port.path, baud, by, open_port, clock, seconds)
+            heard[baud] = listen(port.path, baud, by, open_port, clock, LISTEN_S)
             if fitting := [n for n in these if fits(these[n], heard[baud])]:
                 found = _settings(port, fitting, these, heard[baud])
                 yield PortFinding(port, fitting[0], known + found)

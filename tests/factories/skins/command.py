@@ -9,25 +9,34 @@ import pytest
 
 from palpate.cli import devices as of_command
 from palpate.cli import main as command
-from palpate.core.clock import Clock
+from palpate.cli import simulated_commands
+from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
 from palpate.core.types import SweepFormat
 from palpate.io import skins
-from palpate.sim import script
+from palpate.sim import rig, script
+from palpate.sim.devices import RobotDevices
 from tests.factories.skins import devices, sweeps
 
+BY_BOARD = of_command.simulated
+"""The devices of the box itself, with a readout board."""
 
-def emulated(
+
+def simulated(
     name: str,
     format: SweepFormat | None,
     args: argparse.Namespace,
     settings: Config,
-    clock: Clock,
     *,
-    remember: bool,
-    spread: bool,
-) -> devices.PlayedDevices:
+    remember: bool = True,
+    spread: bool = False,
+    touring: bool = False,
+) -> RobotDevices:
     """A robot with the emulated skin of the settings on a terminal."""
+    if skins.profile(settings).codec == "palpate":
+        more = {"remember": remember, "spread": spread, "touring": touring}
+        return BY_BOARD(name, format, args, settings, **more)
+    clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     profile, follows = skins.profile(settings), settings.trigger.mode == "serial"
     seen = sweeps.view(settings.skin.profile, profile.format)
     acts, source, format = script.named(
@@ -43,7 +52,8 @@ def emulated(
 def main(words: list[str]) -> int:
     """The exit code of a command of the box with emulators."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(of_command, "emulated", emulated)
+        for module in (of_command, simulated_commands):
+            patch.setattr(module, "simulated", simulated)
         return command.main(words)
 
 
