@@ -33,21 +33,20 @@ from numpy.typing import NDArray
 from palpate.answer import features
 from palpate.answer.unknown import Classes, DisplacedClasses, EarlyClasses
 from palpate.bundle import arrays, enrolled
-from palpate.bundle.contents import AddedLabels, Bundle
-from palpate.bundle.enrolled import ENROLMENT
-from palpate.bundle.manifest import (
-    GOLDEN,
-    INPUTS,
-    MANIFEST,
-    MEANS,
-    MODEL,
-    MOST_BYTES,
-    Manifest,
-    Thresholds,
-)
+from palpate.bundle.contents import AddedLabels as AddedLabels
+from palpate.bundle.contents import Bundle as Bundle
+from palpate.bundle.enrolled import ENROLMENT as ENROLMENT
+from palpate.bundle.manifest import GOLDEN as GOLDEN
+from palpate.bundle.manifest import INPUTS as INPUTS
+from palpate.bundle.manifest import MANIFEST as MANIFEST
+from palpate.bundle.manifest import MEANS as MEANS
+from palpate.bundle.manifest import MODEL as MODEL
+from palpate.bundle.manifest import MOST_BYTES
+from palpate.bundle.manifest import Manifest as Manifest
+from palpate.bundle.manifest import Thresholds as Thresholds
 from palpate.bundle.onnx_check import check
 from palpate.core.errors import BundleError, TemporaryError, passes
-from palpate.core.names import LABEL
+from palpate.core.names import LABEL as LABEL
 from palpate.core.status import Status
 
 try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in
@@ -55,19 +54,6 @@ try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this fu
 except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
-__all__ = [
-    "ENROLMENT",
-    "GOLDEN",
-    "INPUTS",
-    "LABEL",
-    "MANIFEST",
-    "MEANS",
-    "MODEL",
-    "AddedLabels",
-    "Bundle",
-    "Manifest",
-    "Thresholds",
-]
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
 MOST_SMALL = 1 << 20
 """Largest size in bytes of a manifest or a signature, whose sizes are not given elsewhere."""
