@@ -38,7 +38,7 @@ from palpate.io.lineless_triggers import (
 from palpate.io.robot_link import Port, SerialSink, StdoutPort
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.io.verdict_lines import LineSink, check_bits
-from palpate.runtime.loop import Answerer, Box, Pipeline
+from palpate.runtime.loop import Answerer, Box
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.sweep_window import SweepCutter
 
@@ -98,8 +98,8 @@ def assembled(
         watching.append(LineSink(lines, codes))
     cutter = SweepCutter(answerer.format, settings.sweep)
     return Box(
-        Pipeline(sensor, trigger, cutter, answerer, early),
-        devices.clock,
+        *(sensor, trigger, cutter, answerer, devices.clock),
+        early=early,
         port=port,
         lines=lines,
         serving=serving,

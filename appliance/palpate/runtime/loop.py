@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -44,31 +43,24 @@ Answerer = Classifier | SweepCheck
 """Gives each sweep its verdict: with a bundle, or without."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pipeline:
-    """The stages between a sweep and its verdict. early: answers unfinished sweeps, or None."""
-
-    sensor: Sensor
-    trigger: Trigger
-    cutter: SweepCutter
-    answerer: Answerer
-    early: EarlyExit | None = None
-
-
 class Box:
     """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer,
     listen.
 
-    port: sends verdicts and state sentences and receives commands, or None. lines: READY, BUSY,
-    FAULT, DECIDED, or None. serving: whether READY may rise. observers: called in this order, after
-    the port. commands: further commands by name. source: origin of the frames, as in sentences.
-    state_s: time between two state sentences."""
+    early: answers unfinished sweeps, or None. port: sends verdicts and state sentences and receives
+    commands, or None. lines: READY, BUSY, FAULT, DECIDED, or None. serving: whether READY may rise.
+    observers: called in this order, after the port. commands: further commands by name. source:
+    origin of the frames, as in sentences. state_s: time between two state sentences."""
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        sensor: Sensor,
+        trigger: Trigger,
+        cutter: SweepCutter,
+        answerer: Answerer,
         clock: Clock,
         *,
+        early: EarlyExit | None = None,
         port: Port | None = None,
         lines: Lines | None = None,
         serving: bool = True,
@@ -83,9 +75,8 @@ class Box:
         self._owed: list[tuple[str, Future[list[object]]]] = []  # commands without an answer yet
         self._edges: list[Edge] = []  # edges that the cutter has not taken yet
         self._failures, self._sound, self._failure = 0, 0, ""
-        self._sensor, self._trigger = pipeline.sensor, pipeline.trigger
-        self._cutter = pipeline.cutter
-        self._answerer, self._early = pipeline.answerer, pipeline.early
+        self._sensor, self._trigger, self._cutter = sensor, trigger, cutter
+        self._answerer, self._early = answerer, early
         self._clock, self._port, self._commands = clock, port, commands
         self._lines, self._serving = lines, serving
         self._source, self._state_ns = source, round(state_s * 1e9)

@@ -26,7 +26,7 @@ from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort, result
 from palpate.runtime import assembly
-from palpate.runtime.loop import Box, Pipeline
+from palpate.runtime.loop import Box
 from palpate.sweeps.capture import Playback
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate.sweeps.sweep_window import SweepCutter
@@ -273,6 +273,11 @@ def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
     classifier = assembly.classifier(settings, bundle, play)
     port = StdoutPort("replay", play.commands)
     cutter = SweepCutter(bundle.format, settings.sweep)
-    pipeline = Pipeline(play, play, cutter, classifier, assembly.early_exit(settings, classifier))
-    box = Box(pipeline, play, port=port, observers=[classifier], source="replay")
+    box = Box(
+        *(play, play, cutter, classifier, play),
+        early=assembly.early_exit(settings, classifier),
+        port=port,
+        observers=[classifier],
+        source="replay",
+    )
     box.run(lambda: play.finished)

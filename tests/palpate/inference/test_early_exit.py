@@ -23,7 +23,7 @@ from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime import assembly
-from palpate.runtime.loop import Box, Pipeline
+from palpate.runtime.loop import Box
 from palpate.sim import devices, gpio, rig, script, skin
 from palpate.sweeps.capture import CaptureWriter, Playback
 from palpate.sweeps.sweep_window import SweepCutter
@@ -432,8 +432,8 @@ def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
     again, kept = [], []
     cutter = SweepCutter(FMT, SweepConfig(lead_ms=100))
     replayed = Box(
-        Pipeline(play, play, cutter, classifier, EarlyExit(classifier)),
-        play,
+        *(play, play, cutter, classifier, play),
+        early=EarlyExit(classifier),
         port=StdoutPort("replay", play.commands),
         observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
     )

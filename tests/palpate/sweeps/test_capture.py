@@ -18,7 +18,7 @@ from palpate.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep
 from palpate.io import packets
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime import assembly
-from palpate.runtime.loop import Box, Pipeline
+from palpate.runtime.loop import Box
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
 from palpate.sweeps.sweep_window import SweepCutter
@@ -34,9 +34,9 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
     classifier = assembly.classifier(load_settings(), model, play)
-    pipeline = Pipeline(play, play, SweepCutter(play.format, SweepConfig()), classifier)
+    parts = play, play, SweepCutter(play.format, SweepConfig()), classifier, play
     observers = [OnSweep(lambda sweep, verdict: sweeps.append(sweep))]
-    box = Box(pipeline, play, port=StdoutPort("replay", play.commands), observers=observers)
+    box = Box(*parts, port=StdoutPort("replay", play.commands), observers=observers)
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
