@@ -47,8 +47,10 @@ def test_simulated_sweeps_stay_out_of_a_box(capsys):
     assert "--sim" in text
 
 
-def test_a_box_without_a_key_says_so_before_sweeps(options, capsys):
-    """No sweep is made in vain."""
+def test_a_box_without_a_key_says_so_before_sweeps(options, tmp_path, capsys):
+    """No sweep is made in vain. A box whose labels are enrolled elsewhere gets no key."""
+    (tmp_path / "enrolment").mkdir()
+    (tmp_path / "enrolment" / "signer").touch()
     code, text = said([*options, "--label", "cork", "--sim", "skin", "--virtual"], capsys)
     assert code == 78
     assert "install" in text
