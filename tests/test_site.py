@@ -43,6 +43,14 @@ def test_the_sources_hold_every_page(build: ModuleType, sources: Path):
     assert all((sources / name).is_file() for name in names)
 
 
+def test_each_finding_is_on_a_page(sources: Path):
+    """So a reader meets it; a link to a finding that was removed would be broken."""
+    told = "".join(page.read_text("utf-8") for page in sources.glob("docs/reference/*.md"))
+    found = [one.name for one in sorted((ROOT / "findings").glob("*.sh"))]
+    assert found
+    assert [name for name in found if f"findings/{name}" not in told] == []
+
+
 def test_a_broken_link_is_named(build: ModuleType, tmp_path: Path):
     """Its page and its target; a picture outside of the project counts as broken."""
     lost: list[str] = []

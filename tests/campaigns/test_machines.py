@@ -30,6 +30,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # emulated processors
 EIGHT_BITS = "eight bits"
 INSIDE = ("default", "int16")
 SHOWN_SWEEPS = 8
+WINDOWS = int(os.environ.get("PALPATE_WINDOWS", "0"))
+"""New windows for each bundle; 0 for the few that it was judged by."""
 
 
 @pytest.fixture(scope="session")
@@ -39,11 +41,13 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
         emulated_machines.set_up()
     folder = tmp_path_factory.mktemp("given")
     shutil.copytree(bundle.DEFAULT, folder / "default")
-    np.save(folder / "default" / "sweeps.npy", sets.load("sim:T-REAL:1001:1").samples[::3])
+    slides = sets.load(f"sim:T-REAL:1001:{1 + WINDOWS // 54}").samples
+    np.save(folder / "default" / "sweeps.npy", slides[:WINDOWS] if WINDOWS else slides[::3])
     for dtype in TENSOR:
         fitted = with_stages(easy(dtype=dtype))
         quantized_bundle.export(fitted, folder / dtype, dtype, "1", "")
-        np.save(folder / dtype / "sweeps.npy", fitted.held.samples)
+        new = easy(WINDOWS // 3 + 1, dtype=dtype, seed=7).samples[:WINDOWS]
+        np.save(folder / dtype / "sweeps.npy", new if WINDOWS else fitted.held.samples)
     for name in INSIDE:
         _show(folder, name)
     overflowing(folder / EIGHT_BITS)
@@ -119,7 +123,10 @@ def there(
     args, env = emulated_machines.command(
         request.param, request.getfixturevalue("given"), results_file
     )
-    done = subprocess.run(args, env=env, capture_output=True, text=True, check=False, timeout=300)
+    limit_s = 300 + 2 * WINDOWS
+    done = subprocess.run(
+        args, env=env, capture_output=True, text=True, check=False, timeout=limit_s
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     with np.load(results_file) as z:
         return request.param, dict(z)
