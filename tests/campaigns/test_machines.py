@@ -32,6 +32,7 @@ INSIDE = ("default", "int16")
 SHOWN_SWEEPS = 8
 WINDOWS = int(os.environ.get("PALPATE_WINDOWS", "0"))
 """New windows for each bundle; 0 for the few that it was judged by."""
+LIMIT_S = 300 + WINDOWS
 
 
 @pytest.fixture(scope="session")
@@ -123,9 +124,8 @@ def there(
     args, env = emulated_machines.command(
         request.param, request.getfixturevalue("given"), results_file
     )
-    limit_s = 300 + 2 * WINDOWS
     done = subprocess.run(
-        args, env=env, capture_output=True, text=True, check=False, timeout=limit_s
+        args, env=env, capture_output=True, text=True, check=False, timeout=LIMIT_S
     )
     assert done.returncode == 0, done.stdout + done.stderr
     with np.load(results_file) as z:
