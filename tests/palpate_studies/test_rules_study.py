@@ -61,9 +61,10 @@ def test_the_table_has_each_row(few: dict[tuple[str, ...], dict]):
 def test_the_command_writes_its_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """With slides of other places as displaced ones."""
     out = tmp_path / "rules.json"
-    given = "--set", SLIDES, "--moved", "sim:T-HARD/level-blind:101:1", "--each", "1"
+    moved = "sim:T-HARD/level-blind:101:1"
+    given = "--set", SLIDES, "--moved", moved, "--each", "1"
     assert main(["rules", *given, "--out", str(out)]) == 0
     found = json.loads(out.read_bytes())
-    assert found["sets"] == [SLIDES, "sim:T-HARD/level-blind:101:1"]
+    assert found["sets"] == [SLIDES, moved]
     assert found["rows"][0]["total"]["displaced"] == 7
     assert "| hum |" in capsys.readouterr().out

@@ -1,7 +1,6 @@
 """The study `stress`: its page by the cost of each corruption, and the command."""
 
 import json
-import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -78,8 +77,9 @@ def test_pairs_show_what_is_left_of_each_method():
     columns = stress_report._columns(stress_data.figures(), "pairs")
     assert list(columns)[:2] == [stress_report.BOX, stress_report.NETWORK]
     first, second = stress_report.pair_lines(columns)
-    assert first == ["50 Hz hum and dead taxels", "0", "85", "85", "45", "80", "74", "65", "74"]
-    assert second[0] == "higher gain and 50 Hz hum"
+    assert first[0].split(" and ") == ["50 Hz hum", "dead taxels"]
+    assert first[1:] == ["0", "85", "85", "45", "80", "74", "65", "74"]
+    assert second[0].split(" and ") == ["higher gain", "50 Hz hum"]
     assert stress_report.pair_lines({}) == []
 
 
@@ -98,8 +98,7 @@ def test_the_page_holds_the_figures():
     earlier = [{"methods": ["H-svm"], "commit": "0ld"}]
     page, pictures = stress_report.render(stress_data.figures() | {"earlier": earlier})
     reader = PageReader(page)
-    assert (reader.wrong, reader.open) == ([], [])
-    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Undefined", reader.text)
+    assert reader.faults == []
     assert all(html.picture(svg) in page for svg in pictures.values())
     for fact in (
         f"{OURS} classifies 98.0 %",
@@ -133,7 +132,7 @@ def test_the_command_makes_the_result_again():
     """Of recorded sweeps the conditions that were kept and the part that is tested."""
     figures = stress_data.figures()
     simulated = stress_report.command(figures, "stress")
-    assert "--set sim:T-REAL:1 --test sim:T-REAL:101:2 --method palpate," in simulated
+    assert all(name in simulated.split() for name in ("sim:T-REAL:1", "sim:T-REAL:101:2"))
     recorded = figures | {"train": "f.npz", "only": ["force<=180"], "split": "rep:0.67"}
     words = "--set f.npz --only 'force<=180' --split rep:0.67 --method"
     assert words in stress_report.command(recorded, "stress-fabrics")

@@ -158,4 +158,4 @@ def test_each_test_says_whether_ours_is_ahead():
     for row, cells in zip(rows, parts, strict=True):
         assert all(cell in row for cell in cells), row
     alone = matrix_table.headline([result("palpate", "leave:force", 90)])
-    assert alone.endswith("| – | – | no peer was run |")
+    assert "| – | – |" in alone

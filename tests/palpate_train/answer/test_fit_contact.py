@@ -123,10 +123,8 @@ def test_what_does_not_separate_is_said(how: dict[str, float]):
     found = find_limit(known(**how))
     assert found.contact is None
     assert not found.tare.any()
-    assert re.fullmatch(
-        r"the weakest sweep reads -?[\d.]+ counts above .* differs by up to [\d.]+; send TARE .*",
-        found.why,
-    )
+    assert re.search(r"reads -?[\d.]+ counts", found.why)
+    assert "send TARE" in found.why
 
 
 def test_a_baseline_of_which_nothing_is_known_is_said():

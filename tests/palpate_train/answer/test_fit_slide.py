@@ -45,12 +45,11 @@ def test_without_a_range_the_reason_is_given():
     """No pitch; too few sweeps; sweeps in which nothing slides."""
     sweeps = swept([1.0] * 6)
     resting = replace(sweeps, samples=np.repeat(sweeps.samples[:, :1], 1500, axis=1))
-    assert [
-        trained_speeds(sweeps, None),
-        trained_speeds(swept([1.0] * 4), skin.PITCH_MM),
-        trained_speeds(resting, skin.PITCH_MM),
-    ] == [
-        (None, "the distance between taxels is unknown; export with --pitch-mm"),
-        (None, "the speed was measured in 4 of 4 sweeps"),
-        (None, "the speed was measured in 0 of 6 sweeps"),
-    ]
+    for trained, pitch_mm, why in (
+        (sweeps, None, "--pitch-mm"),
+        (swept([1.0] * 4), skin.PITCH_MM, "4 of 4"),
+        (resting, skin.PITCH_MM, "0 of 6"),
+    ):
+        found, said = trained_speeds(trained, pitch_mm)
+        assert found is None
+        assert why in said

@@ -183,7 +183,7 @@ def test_the_packaged_bundle_bridges_what_its_manifest_says():
 def test_a_bundle_without_the_figure_says_so(tmp_path: Path):
     """Its manifest has no entry either."""
     manifest = bundle.load(toy(tmp_path)).manifest
-    assert fit_taxels.text(manifest) == "broken taxels: not measured, so the box refuses them"
+    assert "not measured" in fit_taxels.text(manifest)
     assert manifest.bridging is None
 
 

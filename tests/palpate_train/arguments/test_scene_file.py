@@ -94,7 +94,8 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
 def test_a_folder_may_be_named_by_a_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The variable is replaced by its value."""
     monkeypatch.setenv("SWEEPS_AT", "/sweeps")
-    assert parsed(tmp_path, 'set = ["$SWEEPS_AT/a.npz"]').sets == ["/sweeps/a.npz"]
+    found = parsed(tmp_path, 'set = ["$SWEEPS_AT/a.npz"]')
+    assert found.sets == ["/sweeps/a.npz"]
 
 
 @pytest.mark.parametrize("name", ["tubes.toml", "fabrics.toml"])

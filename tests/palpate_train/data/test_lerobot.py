@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.core.types import SweepFormat
 from palpate_train.cli.main import main
 from palpate_train.data import lerobot_writer, sets
 from tests.factories import lerobot as environment
@@ -71,7 +72,7 @@ def test_tactile_columns_become_sweeps(tmp_path: Path, version: str):
     more = ("--field", "session=operator", "--field", "trial=episode_index")
     assert imported(folder, *MATERIAL, *more) == 0
     made = sets.load(str(tmp_path / "s.npz"))
-    assert str(made.format) == "2x3 int16 at 30 Hz, window 20"
+    assert made.format == SweepFormat(2, 3, 30.0, 20, "int16")
     assert [made.materials[k] for k in made.labels] == ["wood", "felt", "wood", "felt"]
     assert made.groups["session"].tolist() == ["Ada", "Ada", "Bob", "Bob"]
     assert made.groups["trial"].tolist() == [0, 1, 2, 3]

@@ -9,6 +9,7 @@ import getpass
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import tarfile
@@ -77,6 +78,14 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
+def counts(capsys: pytest.CaptureFixture[str], *names: str) -> list[int]:
+    """The numbers of recordings fetched, there already and refused, as printed in the first line;
+    `names` are printed below it."""
+    first, _, rest = capsys.readouterr().out.partition("\n")
+    assert all(name in rest for name in names)
+    return [int(word) for word in re.findall(r"\d+", first)]
+
+
 @pytest.fixture
 def ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ground:
     """A box with four recordings of two runs."""
@@ -86,15 +95,15 @@ def ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ground:
 def test_what_is_new_is_fetched(ground: Ground, capsys: pytest.CaptureFixture[str]):
     """All recordings at first, then none, then the new recording; folders are the box's."""
     ground.pull()
-    assert capsys.readouterr().out == "fetched 4, there already 0, refused 0\n"
+    assert counts(capsys) == [4, 0, 0]
     assert ground.same()
     ground.ssh("tar", "exit 1")  # no recording that is present is fetched
     ground.pull()
-    assert capsys.readouterr().out == "fetched 0, there already 4, refused 0\n"
+    assert counts(capsys) == [0, 4, 0]
     ground.ssh()
     record(ground.box / "run 1" / "sweep-000004.npy", "a", id=4)
     ground.pull()
-    assert capsys.readouterr().out == "fetched 1, there already 4, refused 0\n"
+    assert counts(capsys) == [1, 4, 0]
     assert ground.same()
 
 
@@ -169,9 +178,7 @@ def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFi
     (ground.box / "run 1" / "sweep-000003.npy").unlink()
     (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
     ground.pull()
-    out = capsys.readouterr().out
-    assert out.startswith("fetched 2, there already 0, refused 0\n")
-    assert "run 0/sweep-000000, run 1/sweep-000003" in out
+    assert counts(capsys, "run 0/sweep-000000", "run 1/sweep-000003") == [2, 0, 0]
     assert sorted(files(ground.here)) == [
         f"run {i // 2}/sweep-00000{i}.{end}" for i in (1, 2) for end in ("json", "npy")
     ]
@@ -199,9 +206,7 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
     theirs.write_text(json.dumps(json.loads(theirs.read_text()) | {"material": "felt"}))
     before = files(ground.here)
     ground.pull()
-    out = capsys.readouterr().out
-    assert out.startswith("fetched 0, there already 2, refused 0\n")
-    assert "run 0/sweep-000000, run 0/sweep-000001" in out
+    assert counts(capsys, "run 0/sweep-000000", "run 0/sweep-000001") == [0, 2, 0]
     assert files(ground.here) == before
 
 
@@ -213,9 +218,7 @@ def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureF
     record(ground.box / "sweep-000009.npy", status=Status.GAP, frames=0)
     with pytest.raises(FormatError, match="3 recordings"):
         ground.pull()
-    out = capsys.readouterr().out
-    assert out.startswith("fetched 2, there already 0, refused 3\n")
-    assert "run 0/sweep-000000 (" in out
+    assert counts(capsys, "run 0/sweep-000000 (") == [2, 0, 3]
     assert sorted(files(ground.here)) == [
         *(f"run 1/sweep-000003.{end}" for end in ("json", "npy")),
         "sweep-000009.json",
@@ -228,7 +231,7 @@ def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
     ground.ssh("tar", f"echo >> '{ground.box}/run 0/sweep-000000.json'")
     tally = ground.fetch()
     (refused,) = tally.refused
-    assert "sweep-000000.json changed" in refused
+    assert "000000.json changed" in refused
     assert len(tally.fetched) == 3
 
 
@@ -366,7 +369,7 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
         pull.pull(
             RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
         )
-    assert capsys.readouterr().err == "user@box: sudo: a password is required\n"
+    assert capsys.readouterr().err.startswith("user@box: sudo: a")
 
 
 def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):

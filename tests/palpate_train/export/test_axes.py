@@ -9,6 +9,7 @@ import pytest
 from palpate.bundle import bundle
 from palpate.cli.main import main as palpate
 from palpate.core.clock import SystemClock
+from palpate.core.types import SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.sim import devices, rig, script
 from palpate.sweeps.black_box import BlackBox
@@ -44,7 +45,7 @@ def test_from_a_set_to_the_answers_of_the_box(
     export = f"export {fit} --out {out} --name sheared --version 1 --full-scale 2047".split()
     assert main([*export, "--pitch-mm", str(PITCH_MM)]) == 0
     model = bundle.load(out)
-    assert str(model.format) == "2x2x3 int16 at 750 Hz, window 600"
+    assert model.format == SweepFormat(2, 2, 750.0, 600, "int16", axes=3)
     assert model.manifest.thresholds.full_scale == 2047
     assert model.manifest.contact
     assert np.abs(np.array(model.manifest.contact.cols_mm) - PITCH_MM / 2).max() < 2
@@ -83,25 +84,12 @@ def test_the_demo_slides_a_skin_that_feels_shear(
 ):
     """With a bundle of three axes `palpate demo` simulates shear, and names most tubes."""
     fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
-    assert (
-        main(f"fit --set sim:T-REALx3/level-blind:1001:1 --seed 1 --out {fit} --size bands".split())
-        == 0
-    )
+    given = f"fit --set sim:T-REALx3/level-blind:1001:1 --seed 1 --out {fit} --size bands"
+    assert main(given.split()) == 0
     assert main(["export", fit, "--out", out, "--name", "shear", "--version", "1"]) == 0
     capsys.readouterr()
-    asked = [
-        "demo",
-        "--sim",
-        "skin",
-        "--virtual",
-        "--seed",
-        "3",
-        "--sweeps",
-        "12",
-        "--set",
-        f"classifier.bundle={out}",
-    ]
-    assert palpate(asked) == 0
+    asked = f"demo --sim skin --virtual --seed 3 --sweeps 12 --set classifier.bundle={out}"
+    assert palpate(asked.split()) == 0
     shown = capsys.readouterr().out
     assert shown.count("-> ") == 12
     assert shown.count("✓") >= 8

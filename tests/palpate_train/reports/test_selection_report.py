@@ -34,7 +34,7 @@ def test_page_and_terminal_say_the_same():
 def test_the_page_is_sound_and_the_terminal_has_a_line_for_each_model():
     """Tags close and foreign names cannot become tags."""
     read = PageReader(selection_report.page(choice_data.choice()))
-    assert (read.wrong, read.open) == ([], [])
+    assert read.faults == []
     assert not re.search(r"[{}]|\bNone\b|\bnan\b", read.text)
     evil = selection_report.page(choice_data.choice(set="</title><script>"))
     assert "&lt;/title&gt;" in evil

@@ -61,7 +61,7 @@ def test_the_command_writes_a_page_of_what_is_named(
     reader = PageReader(out.read_text())
     assert "2 of 12 sweeps of " in reader.text
     assert "11: high, recording 11" in reader.text
-    assert (reader.open, reader.wrong) == ([], [])
+    assert reader.faults == []
     assert all(link.startswith(("#", "data:")) for link in reader.links)
     for name, material in (("0", "a"), ("1", "b")):
         record(tmp_path / "box" / f"{name}.npy", material)

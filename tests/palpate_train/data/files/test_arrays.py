@@ -85,7 +85,7 @@ def test_vectors_are_columns(tmp_path: Path):
     np.testing.assert_array_equal(found.values, SKIN)
     assert found.columns == tuple(f"taxels/s{k}" for k in range(4))
     assert found.vectors["t"][3] == 0.3
-    assert found.notes == ("its 4 arrays of 40 numbers are its columns",)
+    assert "4 arrays" in found.notes[0]
     with h5py.File(tmp_path / "a.h5", "a") as file:
         file["camera"] = np.zeros((5, 6, 6))
     found = raw_files.read(tmp_path / "a.h5", ReadPlan("taxels", time="t"))
@@ -99,7 +99,7 @@ def test_numbered_arrays_are_frames(tmp_path: Path):
     np.savez(tmp_path / "a.npz", **frames)
     found = raw_files.read(tmp_path / "a.npz")
     np.testing.assert_array_equal(found.values.reshape(40, 4), SKIN)
-    assert found.notes == ("its 40 arrays frame 0 to frame 39 are its frames",)
+    assert "frame 0 to frame 39" in found.notes[0]
     for change in ({"frame 12": np.zeros((3, 3))}, {"frame 77": SKIN[:2, :2]}, {"x": SKIN}):
         np.savez(tmp_path / "a.npz", **frames | change)
         with pytest.raises(FormatError, match=r"4\d arrays"):
@@ -136,7 +136,7 @@ def test_json_is_read(tmp_path: Path, content: bytes):
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     np.testing.assert_allclose(found.values[:, 0], np.arange(40) / 10)
     cut = content.endswith(b"sk")
-    assert found.notes == ("read up to line 41, which is cut off",) * cut
+    assert ["line 41" in said for said in found.notes] == [True] * cut
 
 
 def test_acquired_data_is_read(tmp_path: Path):
@@ -220,7 +220,8 @@ def test_null_in_json_is_a_fault(tmp_path: Path):
     rows = [{"a": 1, "b": 2}, {"a": None, "b": 3}, {"a": 1, "b": 3}]
     (tmp_path / "a.jsonl").write_bytes(lines(*rows))
     found = raw_files.read(tmp_path / "a.jsonl")
-    assert found.faults == {0: "line 2, a is None, which is not a number"}
+    assert found.faults.keys() == {0}
+    assert "line 2, a is None" in found.faults[0]
     assert found.values[:, 1].tolist() == [2, 3, 3]
 
 

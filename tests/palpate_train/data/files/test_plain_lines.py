@@ -32,14 +32,14 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
 @pytest.mark.parametrize(
     ("line", "what"),
     [
-        (lambda row: str(row), "brackets are left out"),
-        (lambda row: f"tensor([{' '.join(map(str, row))}]),", "brackets are left out"),
-        (lambda row: f"[[{row[0]}, {row[1]}], [{row[2]}, {row[3]}]]", "brackets are left out"),
-        (joined(",", "'{}'"), "single quotes are left out"),
-        (joined(",", "{} mV"), "units of the cells are left out"),
-        (joined(";", "{}N"), "units of the cells are left out"),
-        (joined(",", "{:x}".replace("{", "0x{")), "marks of hexadecimal numbers are left out"),
-        (joined(",", "{}.0D+00"), "D in exponents are left out"),
+        (lambda row: str(row), "brackets"),
+        (lambda row: f"tensor([{' '.join(map(str, row))}]),", "brackets"),
+        (lambda row: f"[[{row[0]}, {row[1]}], [{row[2]}, {row[3]}]]", "brackets"),
+        (joined(",", "'{}'"), "single quotes"),
+        (joined(",", "{} mV"), "units"),
+        (joined(";", "{}N"), "units"),
+        (joined(",", "{:x}".replace("{", "0x{")), "hexadecimal"),
+        (joined(",", "{}.0D+00"), "exponents"),
         (labelled(",", ":"), ""),
         (labelled(" ", "="), ""),
         (labelled(", ", " = "), ""),
@@ -50,7 +50,7 @@ def test_decorations_are_left_out(tmp_path: Path, line: Callable[[list[int]], st
     """The numbers are read, and a remark names the decoration."""
     found = read(tmp_path, line)
     np.testing.assert_array_equal(found.values, SKIN)
-    assert found.notes == ((what,) if what else ())
+    assert [what in said for said in found.notes] == [True] * bool(what)
     if "s1" in line(SKIN[0].tolist()):
         assert found.columns == NAMES
 
@@ -60,7 +60,7 @@ def test_separators_that_are_no_decimal_sign(tmp_path: Path, sign: str):
     """Switzerland's apostrophe and the blanks of ISO 31, in columns that a semicolon separates."""
     found = read(tmp_path, lambda row: ";".join(f"{v:,}".replace(",", sign) for v in row))
     np.testing.assert_array_equal(found.values, SKIN)
-    assert found.notes == ("separators of thousands are left out",)
+    assert ["thousands" in said for said in found.notes] == [True]
 
 
 def test_blanks_of_other_widths_separate_columns(tmp_path: Path):
@@ -100,10 +100,9 @@ def test_comments_behind_numbers_and_with_slashes(tmp_path: Path):
     (tmp_path / "a.csv").write_text(text)
     found = raw_files.read(tmp_path / "a.csv")
     np.testing.assert_array_equal(found.values, SKIN)
-    assert found.notes == (
-        "comments behind numbers are left out",
-        "1 comments between its frames are passed over",
-    )
+    behind, between = found.notes
+    assert "behind numbers" in behind
+    assert between.startswith("1 comments")
 
 
 def spoilt(folder: Path, row: str) -> Path:
@@ -118,7 +117,8 @@ def spoilt(folder: Path, row: str) -> Path:
 def test_a_bad_cell_is_still_named_by_its_line(tmp_path: Path, cell: str):
     """Nothing is spliced over it, and lines keep their numbers."""
     found = raw_files.read(spoilt(tmp_path, f"[1, {cell}, 3, 4]"))
-    assert found.faults == {1: f"line 8, column 2 is {cell!r}, which is not a number"}
+    assert found.faults.keys() == {1}
+    assert f"line 8, column 2 is {cell!r}" in found.faults[1]
 
 
 def test_a_short_line_is_still_refused(tmp_path: Path):

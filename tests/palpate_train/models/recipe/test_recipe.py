@@ -157,13 +157,11 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     told: list[str] = []
     fit = recipe.fit(easy(), Run(1, told.append), Settings(steps=20))
     assert [int(line.split()[1]) for line in told] == sorted(int(line.split()[1]) for line in told)
-    assert told[0] == f"part 1 of 3, features of {len(easy())} sweeps and 2 copies of each"
+    assert f"features of {len(easy())} sweeps" in told[0]
     steps = [line for line in told if " step " in line]
-    assert re.fullmatch(r"part 3 of 3, step 10/20 loss \d+\.\d+, \d+ s left", steps[9])
+    assert "step 10/20 loss" in steps[9]
     assert steps[-1].endswith(", 0 s left")
-    assert re.fullmatch(
-        r"part 3 of 3, choosing: \d+ filters", told[-1]
-    )  # fewer may do beside stages
+    assert re.search(r": \d+ filters$", told[-1])  # fewer may do beside stages
     assert fit.architecture.channels == STAGES.channels
     stages = sum(STAGES.channels)
     assert fit.plan.parts[0].columns == tuple(range(stages))
@@ -375,7 +373,7 @@ def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
     made = recipe.fit(replace(easy(), groups={}), Run(1), CLOSED)
     numbers = [side.group("recording") for side in (made.train, made.held)]
     assert len(np.unique(np.concatenate(numbers))) == len(easy())
-    assert "held-out recording, by recording" not in made.held_out_figures()
+    assert not [name for name in made.held_out_figures() if name.endswith("by recording")]
 
 
 @pytest.mark.slow
