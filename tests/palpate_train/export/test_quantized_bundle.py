@@ -75,7 +75,7 @@ def tight() -> Fit:
     return with_stages(close(), steps=60)
 
 
-def export(fit: Fit, target: Path, name: str = "easy", **more: Any) -> Manifest:
+def export(fit: Fit | MethodFit, target: Path, name: str = "easy", **more: Any) -> Manifest:
     """Export it as version 1 of a commit; the manifest."""
     return quantized_bundle.export(fit, target, name, "1", "0123abcd", **more)
 
@@ -534,12 +534,12 @@ def test_any_method_is_judged_by_the_same_limits(tmp_path: Path, monkeypatch: py
     made.save(tmp_path / "fit.npz")
     read = MethodFit.read("fit.npz", sweep_set.read(tmp_path / "fit.npz", "a fit"))
     for fit in (made, read):
-        manifest = quantized_bundle.export_method(fit, tmp_path / "b", "close", "1", "")
+        manifest = export(fit, tmp_path / "b", "close")
         assert manifest.figures["parity"]["total"] == len(made.held)
         assert quantized_bundle.text(manifest).startswith("int8 against float: ")
     monkeypatch.setattr(quantized_bundle, "MOST_MEAN_DIFFERENCE", 0.0)
     with pytest.raises(ExportRefused, match=r"limit 0\.0"):
-        quantized_bundle.export_method(read, tmp_path / "b", "close", "1", "")
+        export(read, tmp_path / "b", "close")
 
 
 @pytest.mark.skipif(

@@ -102,17 +102,21 @@ def run_export(args: argparse.Namespace) -> None:
     asked = rules.Asked(tuple(args.kept), tuple(args.left_out))
     pack.check_target(args.out)
     arrays = read(args.fit, WHAT)
-    named = args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
-    made: Fit | MethodFit
-    if "model" in arrays:
-        made = MethodFit.read(args.fit.name, arrays)
-        made.about[pack.LICENCE] = args.licence
-        manifest = quantized_bundle.export_method(made, *named, asked=asked)
-    else:
-        made = Fit.read(args.fit.name, arrays)
-        made.about[pack.LICENCE] = args.licence
+    kind: type[Fit] | type[MethodFit] = MethodFit if "model" in arrays else Fit
+    made = kind.read(args.fit.name, arrays)
+    made.about[pack.LICENCE] = args.licence
+    if isinstance(made, Fit):
         made.about[stranger_limits.COST] = args.stranger_cost
-        manifest = quantized_bundle.export(made, *named, asked=asked)
+    manifest = quantized_bundle.export(
+        made,
+        args.out,
+        args.name,
+        args.version,
+        commit(),
+        full_scale=args.full_scale,
+        pitch_mm=args.pitch_mm,
+        asked=asked,
+    )
     _print(manifest, args.out)
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import onnxruntime
@@ -47,29 +47,40 @@ LICENCE = "licence"
 """Entry of `about` with the licence of the data."""
 
 
+class PackOptions(TypedDict, total=False):
+    """Options of a bundle.
+
+    full_scale: the sensor's highest raw count if that is not the maximum of its type. pitch_mm:
+    distance between taxels; without it the box cannot say how far a contact is from the trained
+    positions. proven (True): measure how many broken taxels the box may bridge, and which rules
+    pay, which takes most of the time; without it the box refuses broken taxels and has all other
+    rules. asked: rules that stay or are left out in any case.
+    """
+
+    full_scale: float | None
+    pitch_mm: float | None
+    proven: bool
+    asked: Asked
+
+
 def pack(
     content: Content,
     target: Path,
     name: str,
     version: str,
     commit: str,
-    full_scale: float | None = None,
-    pitch_mm: float | None = None,
-    proven: bool = True,
-    asked: Asked = ALL,
+    **options: Unpack[PackOptions],
 ) -> bundle.Manifest:
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is
     replaced.
 
-    commit: of the code, for the manifest. full_scale: the sensor's highest raw count if that is not
-    the maximum of its type. pitch_mm: distance between taxels; without it the box cannot say how
-    far a contact is from the trained positions. proven: measure how many broken taxels the box may
-    bridge, and which rules pay, which takes most of the time; without it the box refuses broken
-    taxels and has all other rules. asked: rules that stay or are left out in any case. Raises
-    ExportRefused if a check fails, and BundleError if a label or the target cannot be used.
+    commit: of the code, for the manifest. Raises ExportRefused if a check fails, and BundleError if
+    a label or the target cannot be used.
     """
+    pitch_mm, proven = options.get("pitch_mm"), options.get("proven", True)
+    asked = options.get("asked", ALL)
     files = files_of(content)
-    manifest = _manifest(content, files, (name, version, commit), full_scale)
+    manifest = _manifest(content, files, (name, version, commit), options.get("full_scale"))
     manifest = fit_rules.from_counts(manifest, content, pitch_mm)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:

@@ -3,9 +3,10 @@ does."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import onnx
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.errors import FormatError
-from palpate_train.answer.rules import ALL, Asked
+from palpate_train.answer.rules import ALL
 from palpate_train.data import extras
 from palpate_train.export import fit_rules, pack
 from palpate_train.export.contents import Content, ExportRefused, content_of
+from palpate_train.export.pack import PackOptions
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
 from palpate_train.models.recipe.fitted import Fit, finished
@@ -43,22 +45,32 @@ of a probability, and largest mean change. The worst of 14 fits of four sizes to
 
 
 def export(
-    fit: Fit,
+    fit: Fit | MethodFit,
     target: Path,
     name: str,
     version: str,
     commit: str,
-    full_scale: float | None = None,
-    pitch_mm: float | None = None,
-    proven: bool = True,
-    asked: Asked = ALL,
+    **options: Unpack[PackOptions],
 ) -> bundle.Manifest:
-    """Quantize `fit`, compare its precisions, and pack it; see pack.pack.
+    """Compare the precisions of `fit`, and pack it; see pack.pack.
 
-    If int8 differs too much, the bundle holds the float model, whose trunk is calibrated for that,
-    and `made` says why. Raises FormatError if nothing was held out to judge the bundle by, and
-    ExportRefused if another check fails.
+    If int8 of our recipe differs too much, the bundle holds the float model, whose trunk is
+    calibrated for that, and `made` says why; another method has no form in float to keep instead.
+    Raises FormatError if nothing was held out to judge the bundle by, and ExportRefused if another
+    check fails.
     """
+    if isinstance(fit, Fit):
+        left_out = options.get("asked", ALL).left_out
+        content = _quantized(fit, options.get("pitch_mm"), left_out)
+    else:
+        content = content_of(fit)
+        if fit.reference is not None:
+            content = checked(content, fit.reference)
+    return pack.pack(content, target, name, version, commit, **options)
+
+
+def _quantized(fit: Fit, pitch_mm: float | None, left_out: Sequence[str]) -> Content:
+    """The content of a bundle of our recipe, in int8 or else in float. Raises FormatError."""
     if fit.about["held_out_by"] == "nothing":
         raise FormatError(fit.uncalibrated)
     (reference, model), about = graphs(fit), fit.about
@@ -72,35 +84,7 @@ def export(
     except ExportRefused as e:
         content = replace(content, model=reference, about=about | {"float_because": str(e)})
         fit = finished(fit.in_float())
-    return pack.pack(
-        fit_rules.from_features(content, fit, pitch_mm, asked.left_out),
-        target,
-        name,
-        version,
-        commit,
-        full_scale,
-        pitch_mm,
-        proven,
-        asked,
-    )
-
-
-def export_method(
-    fit: MethodFit,
-    target: Path,
-    name: str,
-    version: str,
-    commit: str,
-    full_scale: float | None = None,
-    pitch_mm: float | None = None,
-    asked: Asked = ALL,
-) -> bundle.Manifest:
-    """As `export`, of a method that is not of our family; it has no form in float to keep instead.
-    Raises ExportRefused if a check fails."""
-    content = content_of(fit)
-    if fit.reference is not None:
-        content = checked(content, fit.reference)
-    return pack.pack(content, target, name, version, commit, full_scale, pitch_mm, asked=asked)
+    return fit_rules.from_features(content, fit, pitch_mm, left_out)
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:

@@ -184,7 +184,14 @@ class PalpateClassifier(
         if licence:
             fit = replace(fit, about=fit.about | {pack.LICENCE: licence})
         return quantized_bundle.export(
-            fit, Path(path), name, version, provenance.commit(), full_scale, pitch_mm, proven
+            fit,
+            Path(path),
+            name,
+            version,
+            provenance.commit(),
+            full_scale=full_scale,
+            pitch_mm=pitch_mm,
+            proven=proven,
         )
 
     @as_value_errors()
