@@ -150,11 +150,11 @@ def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator)
 
 
 def _shift_grid(x: Array, rows: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _regrid(x, rows, 0.0, rows / SHIFTS[-1], rng)
+    return _regrid(x, rows, 0.0, rows / ROWS[1][-1], rng)
 
 
 def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _regrid(x, 0.0, degrees, degrees / TURNS[-1], rng)
+    return _regrid(x, 0.0, degrees, degrees / DEGREES[1][-1], rng)
 
 
 def _some(x: Array, n: float, rng: Generator) -> Array:
@@ -259,187 +259,91 @@ def _noise(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Ar
     return noisy
 
 
-SHIFTS, TURNS, ERRORS_MS = (0, 0.25, 0.5, 1, 1.5), (0, 5, 10, 20, 30), (0, 10, 25, 50, 100)
-HALVES, TAXELS = (0, 0.1, 0.2, 0.35, 0.5), (0, 1, 2, 3, 4)
-CORRUPTIONS = (
-    Corruption(
-        "shift-rows",
-        "skin further along",
-        "rows",
-        SHIFTS,
-        "skin further along the sliding, drawn anew",
-        _shift,
-        "simulated",
-    ),
-    Corruption(
-        "turn",
-        "skin turned",
-        "degrees",
-        TURNS,
-        "skin turned on the finger, drawn anew",
-        _turn,
-        "simulated",
-    ),
-    Corruption(
-        "force-down",
-        "less force",
-        "share",
-        HALVES,
-        "pressed less, drawn anew",
-        partial(_force, -1),
-        "simulated",
-    ),
-    Corruption(
-        "force-up",
-        "more force",
-        "share",
-        HALVES,
-        "pressed more, drawn anew",
-        partial(_force, 1),
-        "simulated",
-    ),
-    Corruption(
-        "speed-down",
-        "slower",
-        "share",
-        HALVES,
-        "slid slower, drawn anew",
-        partial(_speed, -1),
-        "simulated",
-    ),
-    Corruption(
-        "speed-up",
-        "faster",
-        "share",
-        HALVES,
-        "slid faster, drawn anew",
-        partial(_speed, 1),
-        "simulated",
-    ),
-    Corruption(
-        "window",
-        "window off",
-        "ms",
-        ERRORS_MS,
-        "window too early or late, into the rest, drawn anew",
-        _window,
-        "simulated",
-    ),
-    Corruption(
-        "shift-grid",
-        "skin further along",
-        "rows",
-        SHIFTS,
-        "taxels read further on, edge mirrored, new gains",
-        _shift_grid,
-        "files",
-    ),
-    Corruption(
-        "turn-grid",
-        "skin turned",
-        "degrees",
-        TURNS,
-        "taxels read on a turned grid, edge mirrored, new gains",
-        _turn_grid,
-        "files",
-    ),
-    Corruption(
-        "window-held",
-        "window off",
-        "ms",
-        ERRORS_MS,
-        "window too early or late, first or last frame held",
-        _window_held,
-        "files",
-    ),
-    Corruption("dead", "dead taxels", "taxels", TAXELS, "read 0", partial(_random, dead)),
-    Corruption(
+Axis = tuple[str, tuple[float, ...]]
+"""Unit and strengths."""
+ROWS: Axis = "rows", (0, 0.25, 0.5, 1, 1.5)
+DEGREES: Axis = "degrees", (0, 5, 10, 20, 30)
+MS: Axis = "ms", (0, 10, 25, 50, 100)
+SHARE: Axis = "share", (0, 0.1, 0.2, 0.35, 0.5)
+LOST: Axis = "share", (0, 0.02, 0.05, 0.1, 0.2)
+TAXELS: Axis = "taxels", (0, 1, 2, 3, 4)
+DRIFT: Axis = "of full load", LOST[1]
+BITS: Axis = "fewer than 8", TAXELS[1]
+HUM: Axis = "deviations", (0, 0.25, 0.5, 1, 2)
+NOISE: Axis = "deviations", (0, 0.1, 0.2, 0.3, 0.5)
+EDGE, LATE = "edge mirrored, new gains", "window too early or late"
+Row = tuple[str, str, Axis, str, Change]
+_DRAWN: Sequence[Row] = (
+    ("shift-rows", "skin further along", ROWS, "skin further along the sliding", _shift),
+    ("turn", "skin turned", DEGREES, "skin turned on the finger", _turn),
+    ("force-down", "less force", SHARE, "pressed less", partial(_force, -1)),
+    ("force-up", "more force", SHARE, "pressed more", partial(_force, 1)),
+    ("speed-down", "slower", SHARE, "slid slower", partial(_speed, -1)),
+    ("speed-up", "faster", SHARE, "slid faster", partial(_speed, 1)),
+    ("window", "window off", MS, f"{LATE}, into the rest", _window),
+)
+_PLACED: Sequence[Row] = (
+    ("shift-grid", "skin further along", ROWS, f"taxels read further on, {EDGE}", _shift_grid),
+    ("turn-grid", "skin turned", DEGREES, f"taxels read on a turned grid, {EDGE}", _turn_grid),
+    ("window-held", "window off", MS, f"{LATE}, first or last frame held", _window_held),
+)
+_TAXELS: Sequence[Row] = (
+    ("dead", "dead taxels", TAXELS, "read 0", partial(_random, dead)),
+    (
         "stuck",
         "stuck taxels",
-        "taxels",
         TAXELS,
         "each at some count of the set's range",
         partial(_random, stuck),
     ),
-    Corruption(
+    (
         "noisy",
         "noisy taxels",
-        "taxels",
         TAXELS,
         f"white noise of {NOISY:g} of the set's deviations",
         partial(_random, noisy),
     ),
-    Corruption(
+    (
         "gain-spread",
         "uneven gains",
-        "share",
-        HALVES,
+        SHARE,
         "each taxel's gain off by up to this share",
         _gain_spread,
     ),
-    Corruption("gain-down", "lower gain", "share", HALVES, "all gains lower", partial(_gain, -1)),
-    Corruption("gain-up", "higher gain", "share", HALVES, "all gains higher", partial(_gain, 1)),
-    Corruption(
-        "stretch",
-        "slower",
-        "share",
-        HALVES,
-        "slower: all is stretched in time",
-        partial(_stretch, -1),
-        "files",
-    ),
-    Corruption(
-        "shorten",
-        "faster",
-        "share",
-        HALVES,
-        "faster: all is shortened in time",
-        partial(_stretch, 1),
-        "files",
-    ),
-    Corruption(
-        "drift",
-        "drift",
-        "of full load",
-        (0, 0.02, 0.05, 0.1, 0.2),
-        "offset of each taxel, from one to another",
-        _drift,
-    ),
-    Corruption(
-        "bits",
-        "fewer bits",
-        "fewer than 8",
-        (0, 1, 2, 3, 4),
-        "steps of the set's range: 7, 6, 5, 4 bits",
-        _bits,
-    ),
-    Corruption(
+    ("gain-down", "lower gain", SHARE, "all gains lower", partial(_gain, -1)),
+    ("gain-up", "higher gain", SHARE, "all gains higher", partial(_gain, 1)),
+)
+_TIMED: Sequence[Row] = (
+    ("stretch", "slower", SHARE, "slower: all is stretched in time", partial(_stretch, -1)),
+    ("shorten", "faster", SHARE, "faster: all is shortened in time", partial(_stretch, 1)),
+)
+_SIGNAL: Sequence[Row] = (
+    ("drift", "drift", DRIFT, "offset of each taxel, from one to another", _drift),
+    ("bits", "fewer bits", BITS, "steps of the set's range: 7, 6, 5, 4 bits", _bits),
+    (
         "lost",
         "lost frames",
-        "share",
-        (0, 0.02, 0.05, 0.1, 0.2),
+        LOST,
         "frames lost, at most two in a row, filled as the box does",
         _lost,
     ),
-    Corruption(
-        "saturation", "saturation", "share", HALVES, "clipped so far below full load", _saturation
-    ),
-    Corruption(
-        "hum",
-        "50 Hz hum",
-        "deviations",
-        (0, 0.25, 0.5, 1, 2),
-        "50 Hz on all taxels, amplitude",
-        _hum,
-    ),
-    Corruption(
-        "noise",
-        "white noise",
-        "deviations",
-        (0, 0.1, 0.2, 0.3, 0.5),
-        "white, of each taxel's deviation",
-        _noise,
-    ),
+    ("saturation", "saturation", SHARE, "clipped so far below full load", _saturation),
+    ("hum", "50 Hz hum", HUM, "50 Hz on all taxels, amplitude", _hum),
+    ("noise", "white noise", NOISE, "white, of each taxel's deviation", _noise),
+)
+
+
+def _corruption(row: Row, only: str = "", more: str = "") -> Corruption:
+    name, label, (unit, strengths), text, change = row
+    return Corruption(name, label, unit, strengths, text + more, change, only)
+
+
+CORRUPTIONS = (
+    *(_corruption(row, "simulated", ", drawn anew") for row in _DRAWN),
+    *(_corruption(row, "files") for row in _PLACED),
+    *(_corruption(row) for row in _TAXELS),
+    *(_corruption(row, "files") for row in _TIMED),
+    *(_corruption(row) for row in _SIGNAL),
 )
 
 
