@@ -224,16 +224,16 @@ def test_probabilities_come_from_what_was_held_out():
 def test_effort_is_kept():
     """Names and iterations follow the effort; methods can be sent to another process."""
     networks = (
-        *paper_cnn.METHODS,
-        *recurrent.METHODS,
-        *ds_cnn.METHODS,
-        *lite.METHODS,
-        *edge_spectral.METHODS,
+        *paper_cnn.methods(),
+        *recurrent.methods(),
+        *ds_cnn.methods(),
+        *lite.methods(),
+        *edge_spectral.methods(),
     )
     assert tuple(m.name for m in networks) == NETS
     assert all(m.input == "raw" and "\n" not in m.about for m in networks)
     if not torch.cuda.is_available():
-        assert f"{paper_cnn.PROCESSOR_STEPS} iterations" in paper_cnn.METHODS[0].about
+        assert f"{paper_cnn.PROCESSOR_STEPS} iterations" in paper_cnn.methods()[0].about
     s = easy(4)
     again = pickle.loads(pickle.dumps(method("recurrent")))
     np.testing.assert_array_equal(

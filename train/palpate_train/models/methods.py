@@ -34,7 +34,7 @@ SHIPPED = "palpate"
 PACKAGED = "palpate-reattached"
 """The method of `fit --reattached`, which made the packaged bundle."""
 OWN = "palpate_train.models.recipe.palpate"
-"""The module of the methods that `fit` and `export` need. Each such module defines METHODS, and
+"""The module of the methods that `fit` and `export` need. Each such module defines METHODS, or
 methods(effort) if it trains networks."""
 GROUP = "palpate_train.methods"
 """Entry points of packages with further methods. Each has MODULES, the names of its modules."""

@@ -90,6 +90,3 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
             replace(settings, use=replace(effort.use, reattached=True)),
         ),
     )
-
-
-METHODS = methods()

@@ -20,4 +20,4 @@ MODULES = tuple(
         "recurrent",
     )
 )
-"""Each defines METHODS, and methods(effort) if it trains networks."""
+"""Each defines METHODS, or methods(effort) if it trains networks."""

@@ -52,7 +52,7 @@ class AeonModel:
     def logits(self, inputs: Array) -> Array:
         """Raw counts [n, T, R, C] -> float32 [n, K]."""
         found = np.full((len(inputs), self.classes), ABSENT, np.float32)
-        with _undisturbed():
+        with undisturbed():
             for first in range(0, len(inputs), BATCH):
                 part = slice(first, first + BATCH)
                 found[part, self.present] = self.scores(series(inputs[part]))
@@ -78,7 +78,7 @@ def train(sweeps: Dataset, inputs: Array, seed: int, *, name: str, fit: Fit) -> 
         )
     present, labels = np.unique(sweeps.labels, return_inverse=True)
     try:
-        with _undisturbed():
+        with undisturbed():
             scores = fit(series(inputs), labels, seed)
     except ImportError as e:
         raise FormatError(f"{name} needs aeon ({e}); try pip install 'palpate-train[peers]'") from e
@@ -86,14 +86,15 @@ def train(sweeps: Dataset, inputs: Array, seed: int, *, name: str, fit: Fit) -> 
 
 
 def series(counts: Array) -> Array:
-    """Raw counts [n, T, R, C] as aeon takes them: float32 [n, R * C, T], in C order."""
+    """Raw counts [n, T, R, C] as aeon takes them: float32 [n, R * C, T], in C order, since
+    for any other numba compiles again."""
     return np.ascontiguousarray(
         counts.reshape(*counts.shape[:2], -1).transpose(0, 2, 1), np.float32
     )
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def undisturbed() -> Iterator[None]:
     """Use one thread, and restore the random states of numpy and PyTorch, which aeon seeds."""
     before = np.random.get_state()
     try:

@@ -8,27 +8,26 @@ the series of the taxels.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from functools import partial
 
 import onnx
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.networks import (
+    Build,
     PeerNetwork,
     PeerRecipe,
+    centred_network,
     layer_constants,
     network_method,
     scale_steps,
 )
-from palpate_train.data.augment import texture_scale
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
-Array = NDArray[Any]
 CHANNELS, BLOCKS, TAPS = 64, 4, 9
 """As in the small DS-CNN; a depthwise kernel of 3 x 3 becomes one of nine frames."""
 STEPS, FIRST_TAPS = 50, 10
@@ -90,15 +89,10 @@ class DepthwiseSeparable(PeerNetwork):
         return g.model(self.format, "logits", self.head.out_features)
 
 
-def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
-    """The network with random weights; each taxel's mean is subtracted."""
-    return DepthwiseSeparable(format, classes, texture_scale(samples))
+build: Build = partial(centred_network, DepthwiseSeparable)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
     """The method, trained with this effort."""
     about = "DS-CNN, as deployed on microcontrollers, over time (Zhang et al. 2017); also in int8"
     return (network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), int8=INT8_NODES),)
-
-
-METHODS = methods()

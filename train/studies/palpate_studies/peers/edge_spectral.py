@@ -151,6 +151,3 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
         "do (Hymel et al. 2022)"
     )
     return (network_method("edge-spectral", about, build, scale_steps(RECIPE, effort)),)
-
-
-METHODS = methods()

@@ -12,6 +12,7 @@ long.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,14 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.ds_cnn import INT8_NODES, RECIPE
-from palpate_studies.peers.networks import PeerNetwork, layer_constants, network_method, scale_steps
-from palpate_train.data.augment import texture_scale
+from palpate_studies.peers.networks import (
+    Build,
+    PeerNetwork,
+    centred_network,
+    layer_constants,
+    network_method,
+    scale_steps,
+)
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
@@ -188,9 +195,7 @@ def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
     return g("Add", g("Mul", x, g.constant(columns[0])), g.constant(columns[1]))
 
 
-def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
-    """The network with random weights; each taxel's mean is subtracted."""
-    return Lite(format, classes, texture_scale(samples))
+build: Build = partial(centred_network, Lite)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
@@ -200,6 +205,3 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
         "int8"
     )
     return (network_method("lite", about, build, scale_steps(RECIPE, effort), int8=INT8_NODES),)
-
-
-METHODS = methods()

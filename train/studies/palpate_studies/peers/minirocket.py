@@ -20,6 +20,7 @@ from sklearn.preprocessing import StandardScaler
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
+from palpate_studies.peers.aeon_peers import series, undisturbed
 from palpate_studies.peers.linear_head import LinearHeadModel, train_linear_head
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
@@ -68,11 +69,8 @@ def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
         raise FormatError(
             f"minirocket needs aeon ({e}); try pip install 'palpate-train[peers]'"
         ) from e
-    before = np.random.get_state()
-    try:
-        own = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(_series(inputs))
-    finally:
-        np.random.set_state(before)
+    with undisturbed():
+        own = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series(inputs))
     found: tuple[Array, ...] = own.parameters
     return found
 
@@ -82,17 +80,10 @@ def in_aeon(sweeps: Dataset, seed: int) -> Callable[[Array], Array]:
     -> margins [K]."""
     from aeon.transformations.collection.convolution_based import MiniRocket
 
-    own, before = MiniRocket(FEATURES, n_jobs=1, random_state=seed), np.random.get_state()
-    weight, bias = _ridge(own.fit_transform(_series(sweeps.samples)), sweeps.labels)
-    np.random.set_state(before)
-    return lambda counts: weight @ own.transform(_series(counts[None]))[0] + bias
-
-
-def _series(samples: Array) -> Array:
-    """Raw counts [n, T, R, C] as aeon takes them: float32 [n, R * C, T], in C order, since for any
-    other numba compiles again."""
-    flat = samples.reshape(*samples.shape[:2], -1).transpose(0, 2, 1)
-    return np.ascontiguousarray(flat, np.float32)
+    own = MiniRocket(FEATURES, n_jobs=1, random_state=seed)
+    with undisturbed():
+        weight, bias = _ridge(own.fit_transform(series(sweeps.samples)), sweeps.labels)
+    return lambda counts: weight @ own.transform(series(counts[None]))[0] + bias
 
 
 def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:

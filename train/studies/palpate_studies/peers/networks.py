@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor, nn
 
 from palpate.core.types import SweepFormat
+from palpate_train.data.augment import texture_scale
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models.linear_head import ABSENT, hold_out_or_all
@@ -106,6 +107,16 @@ class PeerNetwork(Network):
 
 Build = Callable[[SweepFormat, int, Array], PeerNetwork]
 """(format, number of materials, training samples [N, T, R, C]) -> an untrained network."""
+
+
+def centred_network(
+    make: Callable[[SweepFormat, int, float], PeerNetwork],
+    format: SweepFormat,
+    classes: int,
+    samples: Array,
+) -> PeerNetwork:
+    """The network of `make`, which takes a scale, as a Build; each taxel's mean is subtracted."""
+    return make(format, classes, texture_scale(samples))
 
 
 def layer_constants(g: GraphBuilder, layer: nn.Linear | nn.Conv1d | nn.Conv2d) -> tuple[str, str]:

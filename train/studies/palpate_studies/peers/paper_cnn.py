@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil
 from typing import Any
 
@@ -24,11 +25,11 @@ from palpate_studies.peers.networks import (
     Build,
     PeerNetwork,
     PeerRecipe,
+    centred_network,
     layer_constants,
     network_method,
     scale_steps,
 )
-from palpate_train.data.augment import texture_scale
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
@@ -176,9 +177,7 @@ class ImageNetwork(PeerNetwork):
         return g.model(format, "logits", classes)
 
 
-def build_paper_cnn(
-    format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
-) -> PeerNetwork:
+def build_paper_cnn(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`,
     because the paper prints no scale.
 
@@ -186,23 +185,19 @@ def build_paper_cnn(
     """
     mean = float(samples.mean(dtype=np.float64))
     scale = float(1 / max(samples.std(dtype=np.float64), 1e-6))
-    return ImageNetwork(format, classes, scale, mean, layers)
+    return ImageNetwork(format, classes, scale, mean, PAPER)
 
 
-def build_centred(
-    format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
-) -> PeerNetwork:
-    """The paper's CNN behind a layer that subtracts each taxel's mean."""
-    return ImageNetwork(format, classes, texture_scale(samples), None, layers)
+build_centred: Build = partial(centred_network, partial(ImageNetwork, offset=None, layers=PAPER))
+"""The paper's CNN behind a layer that subtracts each taxel's mean."""
+build_tactnet2: Build = partial(
+    centred_network, partial(ImageNetwork, offset=None, layers=TACTNET2)
+)
+"""TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted.
 
-
-def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
-    """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted.
-
-    Dropout is off at test time, on the box and here. This is the mean field of the published Monte
-    Carlo dropout; the same sweep always gets the same answer.
-    """
-    return ImageNetwork(format, classes, texture_scale(samples), None, TACTNET2)
+Dropout is off at test time, on the box and here. This is the mean field of the published Monte
+Carlo dropout; the same sweep always gets the same answer.
+"""
 
 
 def random_paper_cnn(
@@ -243,6 +238,3 @@ def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
             scale_steps(TACTNET2_RECIPE, effort),
         ),
     )
-
-
-METHODS = methods()

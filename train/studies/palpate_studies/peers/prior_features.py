@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from palpate.answer import time_series
 from palpate.answer.features import axes
@@ -115,7 +116,8 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     centred = x - x.mean(axis=1, keepdims=True)
     varying = centred[centred.var(axis=1) > time_series.FLOOR]
     covariance = np.sqrt(_sum_of_squared_products(centred)) / x.shape[1]
-    together = [*_pairs(varying), *_pairs(np.array([_ranks(one) for one in varying]))]
+    ranks = rankdata(varying, axis=1) - (x.shape[1] + 1) / 2  # equal values share their mean rank
+    together = [*_pairs(varying), *_pairs(ranks)]
     last = [np.log(max(covariance, time_series.FLOOR)), time_series.means(x.mean(axis=0)[None])[0]]
     return np.concatenate(
         [_hjorth(x, rate_hz) @ time_series.weights(x, axes(taxels)), together, last]
@@ -130,14 +132,6 @@ def _hjorth(x: Array, rate_hz: float) -> Array:
     ]
     mobility, of_change = (np.sqrt(after / before) for before, after in pairwise(variances))
     return np.array([np.log(variances[0]), mobility * rate_hz, of_change / mobility])
-
-
-def _ranks(one: Array) -> Array:
-    """Ranks of the values in `one` [T] minus their mean. Equal values share their mean rank."""
-    _, inverse, counts = np.unique(one, return_inverse=True, return_counts=True)
-    rank = np.cumsum(counts) - (counts - 1) / 2
-    shared: Array = rank[inverse] - (len(one) + 1) / 2
-    return shared
 
 
 def _sum_of_squared_products(z: Array) -> float:

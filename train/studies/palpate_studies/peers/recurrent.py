@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,14 @@ from torch import Tensor, nn
 
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.networks import (
+    Build,
     PeerNetwork,
     PeerRecipe,
+    centred_network,
     layer_constants,
     network_method,
     scale_steps,
 )
-from palpate_train.data.augment import texture_scale
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
@@ -81,15 +83,10 @@ def _onnx_gate_order(gates: Tensor) -> Array:
     return np.concatenate([update, reset, new])
 
 
-def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
-    """The network with random weights; each taxel's mean is subtracted."""
-    return Recurrent(format, classes, texture_scale(samples))
+build_recurrent: Build = partial(centred_network, Recurrent)
 
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
     """The method, trained with this effort."""
     about = "gated recurrent unit over patches, the paper's future work"
     return (network_method("recurrent", about, build_recurrent, scale_steps(RECIPE, effort)),)
-
-
-METHODS = methods()
