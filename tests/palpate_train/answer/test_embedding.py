@@ -138,28 +138,26 @@ def test_the_limit_knows_positions_that_were_not_seen():
         at = np.tile(np.repeat(np.arange(places), 5), 2)
         return x + 3 * np.random.default_rng(seed + 1).standard_normal((places, 2))[at], y, at
 
+    def unseen(x, y, at, judged):
+        found = np.full(len(y), np.nan)
+        for _, numbers, fitted, _ in embedding.cross_fitted(x, y, at, judged, 2):
+            found[numbers] = fitted.novelty(x[numbers])
+        return found
+
     (x, y, at), (new, _, _) = drawn(300, 0), drawn(400, 5)
     one, every = embedding.in_two_views(x, y, 2), np.ones(len(y), bool)
-    across = embedding.limit(embedding.cross_fitted_distances(x, y, at, every, 2), 0.95)
+    across = embedding.limit(unseen(x, y, at, every), 0.95)
     assert 0.93 < np.mean(one.novelty(new) <= across) < 0.97
-    seven = (
-        at < 7
-    )  # with few places the covariance is too small, and what fits itself is far too narrow
-    narrow, mine, them = (
-        embedding.in_two_views(x[seven], y[seven], 2),
-        (x[seven], y[seven], at[seven]),
-        every[seven],
-    )
-    itself, others = (
-        embedding.limit(s, 0.95)
-        for s in (narrow.novelty(x[seven]), embedding.cross_fitted_distances(*mine, them, 2))
-    )
+    # with few places the covariance is too small, and what fits itself is far too narrow
+    mine = [of[at < 7] for of in (x, y, at, every)]
+    narrow = embedding.in_two_views(*mine[:2], 2)
+    itself, others = (embedding.limit(s, 0.95) for s in (narrow.novelty(mine[0]), unseen(*mine)))
     kept = [np.mean(narrow.novelty(new) <= at_most) for at_most in (itself, others)]
     assert kept[0] < 0.9 < kept[1]
     few = np.isin(at, (0, 1))
-    assert (np.isfinite(embedding.cross_fitted_distances(x, y, at, few)) == few).all()
+    assert (np.isfinite(unseen(x, y, at, few)) == few).all()
     with pytest.raises(FormatError, match="one group"):
-        embedding.cross_fitted_distances(x, y, 0 * at, every)
+        unseen(x, y, 0 * at, every)
 
 
 def test_each_judge_judges_once_and_never_its_own_group():

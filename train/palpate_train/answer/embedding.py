@@ -340,21 +340,6 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
         yield part_of != part, np.flatnonzero((part_of == part) & judged)
 
 
-def cross_fitted_distances(
-    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
-) -> Array:
-    """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups
-    (int [N]); NaN for the others.
-
-    Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts`
-    and `embed`.
-    """
-    distances = np.full(len(labels), np.nan)
-    for _, numbers, embedding, _ in cross_fitted(features, labels, groups, judged, fixed):
-        distances[numbers] = embedding.novelty(features[numbers])
-    return distances
-
-
 def cross_fitted(
     features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
 ) -> Iterator[tuple[Array, Array, Embedding, Array]]:

@@ -55,11 +55,6 @@ class Measurement:
     rss_mib: float
 
     @property
-    def model_kb(self) -> float:
-        """Size of the model's file in units of 1000 bytes."""
-        return round(self.model_bytes / 1000, 2)
-
-    @property
     def bundle_kb(self) -> float:
         """Size of all files in units of 1000 bytes."""
         return round(self.bundle_bytes / 1000, 2)
