@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from palpate.core.names import MOST_LETTERS
@@ -33,6 +34,7 @@ Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
 """Number of labels up to which the confusion matrix can be read on a phone. With more labels there
 is only the table."""
+QUARTERS = [0, 0.25, 0.5, 0.75, 1]
 MOST_SHOWN = 6
 """Number of materials with an example sweep."""
 MATERIALS = [
@@ -124,20 +126,13 @@ def _displayed(figures: Json) -> Json:
         row
         | {
             "name": shown(row["name"]),
-            "taken_for": [shown(row["taken_for"][0]), row["taken_for"][1]]
-            if row["taken_for"]
-            else row["taken_for"],
+            "taken_for": row["taken_for"] and [shown(row["taken_for"][0]), row["taken_for"][1]],
         }
         for row in figures["materials"]
     ]
-    named = {
-        "labels": [shown(name) for name in figures["labels"]],
-        "answers": {shown(name): given(of) for name, of in figures["answers"].items()},
-        "not_in_the_bundle": {
-            shown(name): given(of) for name, of in figures["not_in_the_bundle"].items()
-        },
-        "materials": rows,
-    }
+    named: dict[str, Any] = {"labels": [*map(shown, figures["labels"])], "materials": rows}
+    for kind in ("answers", "not_in_the_bundle"):
+        named[kind] = {shown(name): given(of) for name, of in figures[kind].items()}
     if left_out := figures.get("left_out"):
         materials = {shown(name): of for name, of in left_out["materials"].items()}
         named["left_out"] = left_out | {"materials": materials}
@@ -147,12 +142,11 @@ def _displayed(figures: Json) -> Json:
 def _in_short(figures: Json) -> Iterator[list[str]]:
     """Rows of the summary: results, weaknesses and cost."""
     named, n = figures["named"], figures["named"]["n"]
-    for what in ("right", "wrong", "not_named"):
-        text = {
-            "right": "classified correctly",
-            "wrong": "wrong label",
-            "not_named": "no label (unsure, unknown or refused)",
-        }[what]
+    for what, text in (
+        ("right", "classified correctly"),
+        ("wrong", "wrong label"),
+        ("not_named", "no label (unsure, unknown or refused)"),
+    ):
         yield [text, f"{formatting.percent(named[what] / n)}, {named[what]} of {n}"]
     worst = min(
         (row for row in figures["materials"] if row["recall"]), key=lambda row: row["recall"][0]
@@ -205,14 +199,8 @@ def _left_out(found: Json | None) -> list[list[str]]:
         ]
         for name, m in found["materials"].items()
     ]
-    return [
-        *rows,
-        [
-            "mean",
-            *(formatting.percent(found["mean"][k]) for k in ("false_known", "kept", "auroc")),
-            "",
-        ],
-    ]
+    means = [formatting.percent(found["mean"][k]) for k in ("false_known", "kept", "auroc")]
+    return [*rows, ["mean", *means, ""]]
 
 
 def _material(row: Json) -> list[str]:
@@ -270,11 +258,8 @@ def calibration(found: Json) -> str:
     axes.scatter(said, right, sizes, color=ACCENT, zorder=3)
     axes.set_xlim(-0.03, 1.03)
     axes.set_ylim(-0.03, 1.03)
-    axes.grid(color=FAINT, linewidth=0.6)
-    for axis in (axes.xaxis, axes.yaxis):
-        set_ticks(axis, [0, 0.25, 0.5, 0.75, 1], percent=True)
-    axes.set_xlabel("predicted probability", color=GREY, size=SMALL)
-    axes.set_ylabel("classified correctly", color=GREY, size=SMALL)
+    set_ticks(axes.xaxis, QUARTERS, percent=True)
+    _shares(axes, "predicted probability", "classified correctly")
     return to_svg(figure, "share right against the predicted probability")
 
 
@@ -282,23 +267,14 @@ def curve(points: Sequence[Json]) -> str:
     """Share of right answers over the number of training sweeps of each material."""
     figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.15, bottom=0.5)
     each, share = [p["each"] for p in points], [p["share"] for p in points]
-    axes.fill_between(
-        each,
-        [p["low"] for p in points],
-        [p["high"] for p in points],
-        color=ACCENT,
-        alpha=0.13,
-        linewidth=0,
-    )
+    low, high = ([p[k] for p in points] for k in ("low", "high"))
+    axes.fill_between(each, low, high, color=ACCENT, alpha=0.13, linewidth=0)
     axes.plot(each, share, color=ACCENT, linewidth=2, marker="o", markersize=4)
     axes.set_xscale("log")
     axes.set_xlim(each[0] / 1.1, each[-1] * 1.1)
     axes.set_ylim(0, 1.02)
-    axes.grid(color=FAINT, linewidth=0.6)
-    set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     set_ticks(axes.xaxis, each)
-    axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL)
-    axes.set_ylabel("classified correctly", color=GREY, size=SMALL)
+    _shares(axes, "training sweeps of each material", "classified correctly")
     return to_svg(figure, "share classified correctly over the number of training sweeps")
 
 
@@ -313,9 +289,14 @@ def strangers(found: Json) -> str:
         write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
     axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
     axes.set_ylim(0, 1.05)
-    axes.grid(color=FAINT, linewidth=0.6)
-    set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)
-    axes.set_xlabel("known sweeps answered", color=GREY, size=SMALL)
-    axes.set_ylabel("unknown ones with a label", color=GREY, size=SMALL)
+    _shares(axes, "known sweeps answered", "unknown ones with a label")
     return to_svg(figure, "unknown sweeps with a label over known sweeps answered")
+
+
+def _shares(axes: Axes, x: str, y: str) -> None:
+    """Grid and labels of a plot of shares."""
+    axes.grid(color=FAINT, linewidth=0.6)
+    set_ticks(axes.yaxis, QUARTERS, percent=True)
+    axes.set_xlabel(x, color=GREY, size=SMALL)
+    axes.set_ylabel(y, color=GREY, size=SMALL)

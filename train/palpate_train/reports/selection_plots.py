@@ -48,16 +48,7 @@ def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> st
     for y, entry in enumerate(tried):
         _model(axes, y, entry, entry["method"] == chosen)
     for text, x in zip(("right", "ms", "kB"), COLUMNS, strict=True):
-        axes.annotate(
-            text,
-            (x, -0.85),
-            xycoords=axes.get_yaxis_transform(),
-            ha="right",
-            va="center",
-            color=GREY,
-            size=SMALL,
-            annotation_clip=False,
-        )
+        _beside(axes, text, (x, -0.85), color=GREY, size=SMALL)
     if wanted:
         axes.axvline(wanted, color=BLACK, linewidth=1, linestyle=(0, (2, 2)))
         write(axes, wanted, -0.85, "wanted", GREY, SMALL)
@@ -77,18 +68,15 @@ def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
     )
     axes.plot(accuracy["mean"], y, "o", color=colour, markersize=6.5 if chosen else 5)
     texts = (entry["method"], percent(accuracy["mean"]), f"{entry['ms']:.2f}", f"{entry['kb']:.0f}")
+    shade, weight = (ACCENT, "bold") if chosen else (BLACK, "normal")
     for text, x in zip(texts, (-0.03, *COLUMNS), strict=True):
-        axes.annotate(
-            text,
-            (x, y),
-            xycoords=axes.get_yaxis_transform(),
-            ha="right",
-            va="center",
-            size=MEDIUM,
-            annotation_clip=False,
-            color=ACCENT if chosen else BLACK,
-            weight="bold" if chosen else "normal",
-        )
+        _beside(axes, text, (x, y), size=MEDIUM, color=shade, weight=weight)
+
+
+def _beside(axes: Axes, text: str, at: tuple[float, float], **style: Any) -> None:
+    """Write `text` to the left of a point in widths of the plot and in its rows."""
+    place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "annotation_clip": False}
+    axes.annotate(text, at, ha="right", va="center", **place, **style)
 
 
 def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
@@ -127,16 +115,9 @@ def _panel(axes: Axes, curve: Json) -> None:
     axes.fill_between(x, low, high, color=ACCENT, alpha=0.13, linewidth=0)
     axes.plot(x, mean, color=GREY, linewidth=1.2)
     for at, point in enumerate(points):
-        kept = point["name"] == curve["kept"]
-        fine = point.get("fine", True)
-        axes.plot(
-            at,
-            mean[at],
-            "o",
-            markersize=7 if kept else 5,
-            color=ACCENT if kept else GREY,
-            markerfacecolor=(ACCENT if kept else GREY) if fine else "none",
-        )
+        size, shade = (7, ACCENT) if point["name"] == curve["kept"] else (5, GREY)
+        face = shade if point.get("fine", True) else "none"
+        axes.plot(at, mean[at], "o", markersize=size, color=shade, markerfacecolor=face)
     axes.set_title(TITLES[curve["kind"]], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_xlim(-0.35, len(points) - 0.65 if len(points) > 1 else 0.35)

@@ -102,16 +102,9 @@ def _finger(page: Axes, samples: NDArray[Any]) -> None:
     side = 0.2
     for row, column in np.ndindex(*shade.shape):
         at = (1.2 + column * side, 1.42 + (shade.shape[0] - 1 - row) * side)
-        page.add_patch(
-            Rectangle(
-                at,
-                side * 0.88,
-                side * 0.88,
-                fc=ACCENT,
-                alpha=0.15 + 0.85 * float(shade[row, column]),
-                ec="none",
-            )
-        )
+        alpha = 0.15 + 0.85 * float(shade[row, column])
+        taxel = Rectangle(at, side * 0.88, side * 0.88, fc=ACCENT, alpha=alpha, ec="none")
+        page.add_patch(taxel)
     page.add_patch(
         FancyArrowPatch(
             (0.55, 0.38), (2.65, 0.38), arrowstyle="-|>", mutation_scale=14, color=BLACK, lw=1.5
@@ -151,19 +144,9 @@ def _answer(page: Axes, verdict: Verdict, labels: tuple[str, ...]) -> None:
     for i, (label, probability) in enumerate(order):
         y = 2.1 - 0.27 * i
         write(page, left, y, label, BLACK if i == 0 else GREY, SMALL, ha="left")
-        page.add_patch(Rectangle((left + 1.05, y - 0.07), width, 0.14, fc=FAINT, ec="none"))
-        page.add_patch(
-            Rectangle(
-                (left + 1.05, y - 0.07), width * float(probability), 0.14, fc=ACCENT, ec="none"
-            )
-        )
-        write(
-            page,
-            left + 1.05 + width + 0.08,
-            y,
-            f"{100 * probability:.1f} %",
-            BLACK if i == 0 else GREY,
-            SMALL,
-            ha="left",
-        )
+        for long, shade in ((width, FAINT), (width * float(probability), ACCENT)):
+            bar = Rectangle((left + 1.05, y - 0.07), long, 0.14, fc=shade, ec="none")
+            page.add_patch(bar)
+        share, shade = f"{100 * probability:.1f} %", BLACK if i == 0 else GREY
+        write(page, left + 1.05 + width + 0.08, y, share, shade, SMALL, ha="left")
     write(page, left, 0.3, "on a serial line and on GPIO lines", GREY, SMALL, ha="left")
