@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.text import printable, say
 from palpate_train.arguments import numbers
@@ -107,6 +108,11 @@ def add_jobs(command: argparse.ArgumentParser) -> None:
 def jobs(text: str) -> int:
     """Read --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
     return -1 if text == "-1" else numbers.whole("--jobs", 1)(text)
+
+
+def add_folder(command: argparse.ArgumentParser, about: str | None = None) -> None:
+    """The option --out, a folder."""
+    command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR", help=about)
 
 
 def writable(path: Path, option: str = "--out") -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from palpate.bundle import bundle
 from palpate.bundle.manifest import Manifest
-from palpate.core import config, outputs, settings_files
+from palpate.core import config, settings_files
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
@@ -49,13 +49,7 @@ def register(add: Add) -> None:
 
 def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    export.add_argument(
-        "--out",
-        type=outputs.folder,
-        required=True,
-        metavar="DIR",
-        help="the bundle; replaced if it is there",
-    )
+    options.add_folder(export, "the bundle; replaced if it is there")
     export.add_argument("--name", required=True)
     export.add_argument("--version", required=True)
     export.add_argument(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate.core.text import say
@@ -68,13 +67,7 @@ def _add_pull(add: Add) -> None:
         dest="folder",
         help=f"on the box ({pull.FOLDER})",
     )
-    command.add_argument(
-        "--out",
-        type=outputs.folder,
-        required=True,
-        metavar="DIR",
-        help="here; its folders are those of the box",
-    )
+    options.add_folder(command, "here; its folders are those of the box")
     command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
     command.add_argument(
         "--ssh-option",

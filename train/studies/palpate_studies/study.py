@@ -6,12 +6,14 @@ both measures and draws.
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate_studies import published
@@ -86,6 +88,21 @@ class StudyRun:
 def results_file(name: str, folder: Path = DATA) -> Path:
     """Where the results of a study lie."""
     return folder / f"{name}.json"
+
+
+def add_out(command: argparse.ArgumentParser, name: str, *, kept: bool = True) -> None:
+    """The option --out of the study `name`, and --kept."""
+    file = results_file(name)
+    command.add_argument(
+        "--out",
+        type=outputs.file(".json"),
+        default=file,
+        metavar="FILE",
+        help=f"file of results ({file})",
+    )
+    if kept:
+        about = "train nothing, report what an earlier run has finished"
+        command.add_argument("--kept", action="store_true", help=about)
 
 
 def read(path: Path, *keys: str) -> Any:

@@ -9,7 +9,6 @@ import argparse
 import os
 from pathlib import Path
 
-from palpate.core import outputs
 from palpate_studies import (
     development_experiment,
     development_times,
@@ -18,7 +17,7 @@ from palpate_studies import (
     recipe_views,
 )
 from palpate_studies.pages import PAGES
-from palpate_studies.study import StudyRun, read, results_file, save
+from palpate_studies.study import StudyRun, add_out, read, save
 from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
 
@@ -40,17 +39,7 @@ def register(add: Add) -> None:
 
 def _add_run(command: argparse.ArgumentParser, name: str) -> None:
     """Options of every study."""
-    file = results_file(name)
-    command.add_argument(
-        "--out",
-        type=outputs.file(".json"),
-        default=file,
-        metavar="FILE",
-        help=f"file of results ({file})",
-    )
-    command.add_argument(
-        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
+    add_out(command, name)
     if name != "paper":
         command.add_argument(
             "--data",

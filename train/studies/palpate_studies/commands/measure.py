@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle import bundle
-from palpate.core import outputs
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
@@ -25,7 +24,7 @@ from palpate_studies import (
     rules_table,
     stress,
 )
-from palpate_studies.study import results_file, save
+from palpate_studies.study import add_out, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
@@ -58,18 +57,7 @@ def register(add: Add) -> None:
     _add_alignment(add)
     _add_rules(add)
     command = add("references", run_references)
-    command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR")
-
-
-def _add_out(command: argparse.ArgumentParser, name: str) -> None:
-    file = results_file(name)
-    command.add_argument(
-        "--out",
-        type=outputs.file(".json"),
-        default=file,
-        metavar="FILE",
-        help=f"file of results ({file})",
-    )
+    options.add_folder(command)
 
 
 def _add_alignment(add: Add) -> None:
@@ -92,7 +80,7 @@ def _add_alignment(add: Add) -> None:
     command.add_argument(
         "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
     )
-    _add_out(command, "alignment")
+    add_out(command, "alignment", kept=False)
 
 
 def _add_rules(add: Add) -> None:
@@ -109,7 +97,7 @@ def _add_rules(add: Add) -> None:
         metavar="N",
         help="sweeps of each alteration and each kind of junk (48)",
     )
-    _add_out(command, "rules")
+    add_out(command, "rules", kept=False)
 
 
 def run_rules(args: argparse.Namespace) -> None:
@@ -142,10 +130,7 @@ def _add_stress(add: Add) -> None:
         help="that answers as the box does (the packaged one; with --split that of `fit` and "
         "`export` at their defaults)",
     )
-    _add_out(command, "stress")
-    command.add_argument(
-        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
+    add_out(command, "stress")
     options.add_effort(command)
     options.add_where(command)
 
@@ -184,10 +169,7 @@ def _add_certainty(add: Add) -> None:
     command.add_argument(
         "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
     )
-    _add_out(command, "certainty")
-    command.add_argument(
-        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
-    )
+    add_out(command, "certainty")
     options.add_effort(command)
     options.add_where(command)
 

@@ -29,13 +29,7 @@ def register(add: Add) -> None:
     command.add_argument(
         "names", nargs="*", metavar="NAME", help=f"some of {', '.join(pages.PAGES)} (all)"
     )
-    command.add_argument(
-        "--out",
-        type=outputs.folder,
-        required=True,
-        metavar="DIR",
-        help="a folder for each page is made there",
-    )
+    options.add_folder(command, "a folder for each page is made there")
     command.add_argument(
         "--results",
         type=Path,
