@@ -398,30 +398,20 @@ def test_a_folder_of_sets_names_them(tmp_path: Path):
         sets.load(str(tmp_path))
 
 
-def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The message gives the cause, instead of claiming that the folder is empty."""
-
-    def denied(self: Path) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, "iterdir", denied)
-    with pytest.raises(FormatError, match="Permission"):
-        sets.load(str(tmp_path))
-
-
-@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.data"])
-def test_a_file_that_may_not_be_read_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-):
-    """The message gives the cause, before a library fails on the file with its own words."""
-    file = Path(write(tmp_path / "a.npz")).rename(tmp_path / name)
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.data", "folder"])
+def test_what_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
+    """The message gives the cause, before a library fails on a file with its own words, and instead
+    of claiming that a folder is empty."""
+    (tmp_path / "folder").mkdir()
+    Path(write(tmp_path / "b.npz")).rename(tmp_path / ("c" if name == "folder" else name))
 
     def denied(self: Path, mode: str = "r") -> None:
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "open", denied)
-    with pytest.raises(FormatError, match=f"^{name}: .*Permission denied"):
-        sets.load(str(file))
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(FormatError, match=f"{name}: .*Permission denied"):
+        sets.load(str(tmp_path / name))
 
 
 def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
