@@ -32,11 +32,7 @@ def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
     at = np.repeat(np.arange(places), 4 * n) + first
     grown = np.minimum(np.arange(1, 11) / 5, 1)
     means = apart / np.sqrt(2) * np.eye(4)  # any two are `apart`
-    x = (
-        means[labels][:, None] * grown[:, None]
-        + rng.standard_normal((len(labels), 1, 4))
-        + 0 * grown[:, None]
-    )
+    x = means[labels][:, None] * grown[:, None] + rng.standard_normal((len(labels), 1, 4))
     return x, labels, at
 
 
@@ -49,24 +45,8 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
     x, y, at = x[keep], y[keep], at[keep]
     seen = at % 2 == 1
     copied = x[:, -1] + np.random.default_rng(9).normal(0, 0.1, (len(x), 4))
-    return Case(
-        left_out,
-        fold,
-        2,
-        x,
-        y,
-        at[None],
-        ~seen,
-        True,
-        copied,
-        y,
-        np.arange(len(y)),
-        ~seen,
-        new,
-        labels,
-        there,
-        np.zeros(len(y), bool),
-    )
+    known = x, y, at[None], ~seen, True, copied, y, np.arange(len(y)), ~seen
+    return Case(left_out, fold, 2, *known, new, labels, there, np.zeros(len(y), bool))
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +62,10 @@ def test_error_is_the_gap_between_probability_and_accuracy():
     assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
     assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
     confidence = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
-    assert uncertainty.error(
-        confidence, np.concatenate([np.ones(50, bool), np.arange(50) < 5])
-    ) == pytest.approx(0.25)
-    assert uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))[-1] == {
-        "said": 1.0,
-        "right": 1.0,
-        "n": 1,
-    }
+    right = np.concatenate([np.ones(50, bool), np.arange(50) < 5])
+    assert uncertainty.error(confidence, right) == pytest.approx(0.25)
+    *_, last = uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))
+    assert last == {"said": 1.0, "right": 1.0, "n": 1}
 
 
 def test_temperature_scaling_corrects_an_overconfident_head():
@@ -101,13 +77,10 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups[0], one.held))
     figures = certainty.calibration([(one, done)])
     right = figures["accuracy"]["accuracy"]
-    mean = {
-        when: np.average(
-            [b["said"] for b in figures[when]["bins"]],
-            weights=[b["n"] for b in figures[when]["bins"]],
-        )
-        for when in ("before", "after")
-    }
+    mean = {}
+    for when in ("before", "after"):
+        said, n = zip(*((b["said"], b["n"]) for b in figures[when]["bins"]), strict=True)
+        mean[when] = np.average(said, weights=n)
     assert figures["n"] == sum(b["n"] for b in figures["after"]["bins"]) == 12 * 4 * 24
     assert done.temperature > 1.3
     assert mean["before"] > right + 0.1
@@ -152,21 +125,17 @@ def test_of_two_materials_none_is_left_out():
     """The page has calibration and early answers, and nothing of left-out materials."""
     one = case()
     two, test, also = one.seen_labels < 2, one.labels < 2, one.copied_labels < 2
-    fewer = replace(
-        one,
-        seen=one.seen[two],
-        seen_labels=one.seen_labels[two],
-        seen_groups=one.seen_groups[:, two],
-        held=one.held[two],
-        copied=one.copied[also],
-        copied_labels=one.copied_labels[also],
-        copied_source=np.cumsum(two)[one.copied_source[also]] - 1,
-        copied_held=one.copied_held[also],
-        new=one.new[test],
-        labels=one.labels[test],
-        places=one.places[test],
-        faulty=one.faulty[two],
-    )
+    of_parts = {
+        name: getattr(one, name)[part]
+        for names, part in (
+            ("seen seen_labels held faulty", two),
+            ("copied copied_labels copied_held", also),
+            ("new labels places", test),
+        )
+        for name in names.split()
+    }
+    source = np.cumsum(two)[one.copied_source[also]] - 1
+    fewer = replace(one, seen_groups=one.seen_groups[:, two], copied_source=source, **of_parts)
     figures = certainty.figures([fewer], NAMES[:2])
     assert set(figures) == {"calibration", "early"}
     html, pictures = uncertainty_report.render(figures | ABOUT)
@@ -191,12 +160,8 @@ def sweeps(materials: int = 3) -> Dataset:
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(materials), 6), 4)
     t = np.arange(128)[:, None] / 36
-    hum = np.stack(
-        [
-            np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2)
-            for k in labels
-        ]
-    )
+    pitch = 2 * np.pi * (3 + 3 * labels)
+    hum = np.stack([np.sin(w * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2) for w in pitch])
     x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
     position = np.repeat(np.arange(4), 6 * materials)
     return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")

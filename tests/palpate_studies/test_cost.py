@@ -23,37 +23,16 @@ def test_weights_and_multiply_accumulates_are_counted():
 
 def test_a_gru_a_kernel_and_neighbours_are_counted():
     """One node each, with costs computed by hand."""
-    nodes = {
-        "GRU": (
-            [7, 1, 5],
-            helper.make_node("GRU", ["x", "w", "r"], ["y"], hidden_size=4),
-            7 * 3 * 4 * (5 + 4),
-        ),
-        "CDist": (
-            [1, 5],
-            helper.make_node("CDist", ["x", "w"], ["y"], domain="com.microsoft"),
-            1 * 12 * 5,
-        ),
-        "SVM": (
-            [1, 5],
-            helper.make_node(
-                "SVMClassifier",
-                ["x"],
-                ["y"],
-                domain="ai.onnx.ml",
-                support_vectors=[0.0] * 15,
-                coefficients=[0.0] * 3,
-            ),
-            18,
-        ),
-    }
-    for shape, node, expected in nodes.values():
+    svm = {"support_vectors": [0.0] * 15, "coefficients": [0.0] * 3, "domain": "ai.onnx.ml"}
+    for kind, given, shape, w, expected, more in (
+        ("GRU", "xwr", [7, 1, 5], [1, 12, 5], 7 * 3 * 4 * (5 + 4), {"hidden_size": 4}),
+        ("CDist", "xw", [1, 5], [12, 5], 1 * 12 * 5, {"domain": "com.microsoft"}),
+        ("SVMClassifier", "x", [1, 5], [12, 5], 18, svm),
+    ):
+        node = helper.make_node(kind, [*given], ["y"], **more)
         weights = [
             onnx.numpy_helper.from_array(np.zeros(of, np.float32), name)
-            for name, of in (
-                ("w", [1, 12, 5] if node.op_type == "GRU" else [12, 5]),
-                ("r", [1, 12, 4]),
-            )
+            for name, of in (("w", w), ("r", [1, 12, 4]))
         ]
         x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
         y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
@@ -70,11 +49,8 @@ def test_a_graph_of_unknown_shapes_is_refused():
     x = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])
     w = onnx.numpy_helper.from_array(np.zeros((3, 2), np.float32), "w")
     y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
-    model = helper.make_model(
-        helper.make_graph(
-            [helper.make_node("MatMul", ["x", "w"], ["y"], "product")], "g", [x], [y], [w]
-        )
-    )
+    node = helper.make_node("MatMul", ["x", "w"], ["y"], "product")
+    model = helper.make_model(helper.make_graph([node], "g", [x], [y], [w]))
     with pytest.raises(FormatError, match=r"'product'.*'x' is not"):
         cost.macs(model)
 
