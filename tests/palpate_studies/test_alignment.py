@@ -26,13 +26,9 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     wide = replace(
         model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
     )
-    figures = alignment.measure(
-        Classifier(wide, SystemClock()),
-        "sim:T-LAB/level-blind:3:2",
-        "sim:T-LAB/level-blind:1:1",
-        "sim:T-HARD/level-blind:1:1",
-        lambda line: None,
-    )
+    names = [f"sim:{name}" for name in ("T-LAB/level-blind:3:2", "T-LAB/level-blind:1:1")]
+    box = Classifier(wide, SystemClock())
+    figures = alignment.measure(box, *names, "sim:T-HARD/level-blind:1:1", lambda line: None)
     assert figures["other positions"]["moved"][0] == 0
     assert figures["T-HARD"]["moved"][0] == 1
     back, home, ahead = figures["moved"]["rows"]
@@ -53,14 +49,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     starts = ("| T-HARD, a row ahead", "| not at all | ")
     assert all(map(str.startswith, table.splitlines()[4:], starts))
     assert f"| {home['unsure']} | {home['unknown']} | " in table.splitlines()[-1]
+    without = replace(wide.manifest, contact=None, displacement=None)
+    box = Classifier(replace(wide, manifest=without), SystemClock())
     with pytest.raises(FormatError, match="no positions"):
-        alignment.measure(
-            Classifier(
-                replace(wide, manifest=replace(wide.manifest, contact=None, displacement=None)),
-                SystemClock(),
-            ),
-            "",
-            "",
-            "",
-            print,
-        )
+        alignment.measure(box, "", "", "", print)

@@ -58,14 +58,8 @@ def made(
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
-    return Dataset(
-        samples.astype(dtype),
-        labels,
-        names,
-        rate_hz,
-        {"recording": np.arange(shape[0]) // 2},
-        "made",
-    )
+    groups = {"recording": np.arange(shape[0]) // 2}
+    return Dataset(samples.astype(dtype), labels, names, rate_hz, groups, "made")
 
 
 def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> networks.NetworkModel:
@@ -223,13 +217,8 @@ def test_probabilities_come_from_what_was_held_out():
 
 def test_effort_is_kept():
     """Names and iterations follow the effort; methods can be sent to another process."""
-    networks = (
-        *paper_cnn.methods(),
-        *recurrent.methods(),
-        *ds_cnn.methods(),
-        *lite.methods(),
-        *edge_spectral.methods(),
-    )
+    peers = paper_cnn, recurrent, ds_cnn, lite, edge_spectral
+    networks = [one for peer in peers for one in peer.methods()]
     assert tuple(m.name for m in networks) == NETS
     assert all(m.input == "raw" and "\n" not in m.about for m in networks)
     if not torch.cuda.is_available():

@@ -63,13 +63,8 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten has a changed copy of its material and group; no copy judges."""
     fit = recipe.fit(easy(16), Run(1), recipe.Settings())
     given = calibration_inputs(fit)
-    prefixes, labels, groups, held, faulty = (
-        given.prefixes,
-        given.labels,
-        given.groups,
-        given.held,
-        given.faulty,
-    )
+    prefixes, labels, groups = given.prefixes, given.labels, given.groups
+    held, faulty = given.held, given.faulty
     assert (
         len(prefixes) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + faulty.sum()
     )

@@ -87,18 +87,10 @@ def known(drift: float = 0.0, load: float = 1000.0) -> Dataset:
     rest = REST + drift * np.arange(n).reshape(-1, 1, 1, 1)
     samples = rest + rng.normal(0, 3, (n, 50, 2, 2))
     samples[:, :, 0, 0] += load
-    unloaded = np.concatenate(
-        [np.broadcast_to(rest, (n, 1, 2, 2)), np.full((n, 1, 2, 2), 3.0)], axis=1
-    )
-    return Dataset(
-        np.rint(samples).astype(np.uint16),
-        np.arange(n) % 2,
-        ("a", "b"),
-        50.0,
-        {},
-        "known",
-        unloaded,
-    )
+    level, noise = np.broadcast_to(rest, (n, 1, 2, 2)), np.full((n, 1, 2, 2), 3.0)
+    samples = np.rint(samples).astype(np.uint16)
+    unloaded = np.concatenate([level, noise], axis=1)
+    return Dataset(samples, np.arange(n) % 2, ("a", "b"), 50.0, {}, "known", unloaded)
 
 
 def test_a_load_is_above_the_unloaded_skin():

@@ -175,25 +175,11 @@ def made():
     done = replace(done, rule=fit_early.EarlyRule(Early((0.9,) * 9, 2)))
     model = bundle_graph(done, trunk(FORMAT), trunks)
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: means_file(done.classes())}
-    manifest = Manifest(
-        "toy",
-        "1",
-        FORMAT,
-        "raw",
-        ("a", "b", "c"),
-        Thresholds(1.0, 32767.0),
-        {k: bundle.file_entry(v) for k, v in files.items()},
-        early=done.rule.early,
-        known=done.known(),
-    )
-    whole = bundle.Bundle(
-        manifest,
-        "0",
-        files[bundle.MODEL],
-        counts[:2],
-        run(model, counts[:2]),
-        done.embedding.classes(),
-    )
+    named = "toy", "1", FORMAT, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0)
+    entries = {k: bundle.file_entry(v) for k, v in files.items()}
+    manifest = Manifest(*named, entries, early=done.rule.early, known=done.known())
+    golden = counts[:2], run(model, counts[:2])
+    whole = bundle.Bundle(manifest, "0", files[bundle.MODEL], *golden, done.embedding.classes())
     return done, x, counts, labels, whole
 
 

@@ -12,15 +12,10 @@ from palpate_train.data.sets import Dataset
 
 def swept(speeds: list[float]) -> Dataset:
     """One simulated sweep at each multiple of 30 mm/s."""
-    windows = [
-        skin.window(
-            "plastic rough",
-            skin.Placement(),
-            np.random.default_rng(i),
-            replace(skin.WORLD, speed=speed),
-        )
-        for i, speed in enumerate(speeds)
-    ]
+    windows = []
+    for i, speed in enumerate(speeds):
+        rng, world = np.random.default_rng(i), replace(skin.WORLD, speed=speed)
+        windows.append(skin.window("plastic rough", skin.Placement(), rng, world))
     labels = np.zeros(len(windows), np.int64)
     groups = {"recording": np.arange(len(windows))}
     return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")

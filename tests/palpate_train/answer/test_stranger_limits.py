@@ -25,15 +25,9 @@ def left_out(
     rng = np.random.default_rng(seed)
     labels, values = np.arange(n) % MATERIALS, np.arange(n) // MATERIALS % parts
     known, strangers = rng.normal(0.0, 0.5, (2, n))
-    return LeftOut(
-        np.exp(known + inflated),
-        np.exp(strangers + apart + inflated),
-        np.exp(strangers + apart),
-        np.exp(known - 3),
-        labels,
-        values,
-        parts,
-    )
+    strangers += apart
+    logs = known + inflated, strangers + inflated, strangers, known - 3
+    return LeftOut(*map(np.exp, logs), labels, values, parts)
 
 
 @given(st.floats(0.01, 100), st.floats(1.01, 10), st.integers(0, 5))

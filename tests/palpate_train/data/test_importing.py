@@ -412,16 +412,11 @@ def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: st
         variable="{material}_{trial:d}",
     ).sweeps
     assert made.materials == ("felt", "wool")
-    held = zip(
-        made.labels,
-        made.group("session"),
-        made.group("trial"),
-        made.samples[:, 0, 0, 0],
-        strict=True,
-    )
+    columns = made.labels, made.group("session"), made.group("trial"), made.samples[:, 0, 0, 0]
     first = int(COUNTS[15, 0])
     wanted = [(m, "mo" if k < 3 else "tu", k, first + k) for m in (0, 1) for k in (1, 2, 3, 4)]
-    assert sorted((int(a), str(b), int(c), int(d)) for a, b, c, d in held) == wanted
+    found = [(int(a), str(b), int(c), int(d)) for a, b, c, d in zip(*columns, strict=True)]
+    assert sorted(found) == wanted
     assert len(np.unique(made.group("recording"))) == 8
 
 

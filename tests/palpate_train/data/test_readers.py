@@ -46,12 +46,8 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
     assert (a.format, a.materials) == (FORMAT, ("a", "b", "ç"))
     np.testing.assert_array_equal(a.samples, held()["samples"])
     np.testing.assert_array_equal(a.groups["speed"], held()["group_speed"])
-    b = hdf5(
-        tmp_path / "b.data",
-        rate_hz=None,
-        materials=np.array([b"a", b"b", "ç".encode()]),
-        samples=None,
-    )
+    names = np.array([b"a", b"b", "ç".encode()])
+    b = hdf5(tmp_path / "b.data", rate_hz=None, materials=names, samples=None)
     with h5py.File(b, "a") as file:
         file["samples"] = held()["samples"].astype(">i2")
         file["notes"] = h5py.ExternalLink("/nowhere.h5", "/x")  # not read

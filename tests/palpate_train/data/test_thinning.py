@@ -13,13 +13,7 @@ from tests.factories.sweep_sets import easy
 def uneven() -> Dataset:
     """3, 40 and 200 sweeps of three materials; the first count is the sweep's number."""
     labels = np.repeat([0, 1, 2], [3, 40, 200])
-    recording = np.concatenate(
-        [
-            np.arange(3),
-            3 + np.repeat(np.arange(4), 10),
-            7 + np.repeat(np.arange(5), [100, 50, 30, 16, 4]),
-        ]
-    )
+    recording = np.repeat(np.arange(12), [*[1] * 3, *[10] * 4, 100, 50, 30, 16, 4])
     base = easy(1)
     samples = np.zeros((len(labels), *base.samples.shape[1:]), np.int16)
     samples[:, 0, 0, 0] = np.arange(len(labels))

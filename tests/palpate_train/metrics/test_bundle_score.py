@@ -27,14 +27,8 @@ def sweeps(
 ) -> Dataset:
     """A set for the toy bundle."""
     samples = np.stack([toy_bundle.window(*z) for z in embeddings])
-    return Dataset(
-        samples,
-        np.array(labels),
-        tuple(materials),
-        100.0,
-        {k: np.array(v) for k, v in groups.items()},
-        "s.npz",
-    )
+    values = {k: np.array(v) for k, v in groups.items()}
+    return Dataset(samples, np.array(labels), tuple(materials), 100.0, values, "s.npz")
 
 
 @pytest.fixture
@@ -45,16 +39,8 @@ def classifier(tmp_path: Path) -> Classifier:
 
 def test_what_is_named_is_counted(classifier: Classifier):
     """By material; the interval resamples positions."""
-    s = sweeps(
-        (0, 0),
-        (0, 0),
-        (6, 0),
-        (0, 6),
-        (3, 0),
-        (40, 40),
-        labels=[0, 0, 0, 2, 1, 2],
-        position=[1, 1, 2, 2, 3, 3],
-    )
+    places = (0, 0), (0, 0), (6, 0), (0, 6), (3, 0), (40, 40)
+    s = sweeps(*places, labels=[0, 0, 0, 2, 1, 2], position=[1, 1, 2, 2, 3, 3])
     found = bundle_score.score(classifier, s)
     assert found.right.tolist() == [True, True, False, True, False, False]
     assert found.answered["a"] == Counter(a=2, b=1)
@@ -70,13 +56,8 @@ def test_what_is_named_is_counted(classifier: Classifier):
     assert "3 of 6: 50.0 % [" in lines[1]
     assert lines[1].endswith("by position (3)")
     assert "  a     2 of 3     b 1" in lines
-    assert (
-        found.right
-        == (
-            (bundle_score.labels_of(classifier, s)[0] == s.labels)
-            & bundle_score.labels_of(classifier, s)[1]
-        )
-    ).all()
+    labels, named = bundle_score.labels_of(classifier, s)[:2]
+    assert (found.right == ((labels == s.labels) & named)).all()
 
 
 def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):

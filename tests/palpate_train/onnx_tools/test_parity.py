@@ -16,12 +16,8 @@ def booleans(n: int, wrong: list[int]) -> np.ndarray:
 def test_what_is_lost_is_counted_in_pairs():
     """Three lost, one won, by hand; none lost in a hundred proves nothing."""
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
-    assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (
-        50,
-        49,
-        47,
-        pytest.approx(0.04),
-    )
+    assert (lost.total, lost.float_right, lost.int8_right) == (50, 49, 47)
+    assert lost.lost == pytest.approx(0.04)
     middle = (3.5 - 1.5) / 52
     reach = 1.96 * np.sqrt((5 / 52 - middle**2) / 52)
     assert (lost.low, lost.high) == (pytest.approx(middle - reach), pytest.approx(middle + reach))

@@ -77,20 +77,11 @@ def test_the_header_is_collected_wherever_figures_say_it():
     """From joined runs, lists and sets of parts, but names that stand for several."""
     figures = {
         "runs": [
-            {
-                "methods": ["palpate"],
-                "seeds": [1, 2],
-                "commit": "a",
-                "shipped": "11111111",
-                "date": "2026-01-02",
-            },
-            {
-                "methods": ["minirocket"],
-                "seeds": [3],
-                "commit": "b",
-                "shipped": "22222222",
-                "date": "2026-01-03",
-            },
+            {"methods": [name], "seeds": seeds, "commit": commit, "shipped": id, "date": date}
+            for name, seeds, commit, id, date in (
+                ("palpate", [1, 2], "a", "11111111", "2026-01-02"),
+                ("minirocket", [3], "b", "22222222", "2026-01-03"),
+            )
         ],
         "parts": {"hard": {"sets": ["sim:T-REAL:{w}"]}},
         "results": [{"method": "H-svm", "set": "sim:T-REAL:1", "seed": 4, "right": True}],

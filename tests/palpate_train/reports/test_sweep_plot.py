@@ -17,40 +17,25 @@ from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy
 
 SVG = "{http://www.w3.org/2000/svg}"
+SHARES = 0.98765, 0.01235
 ABOUT = {
     "tare": [[1.5] * 4] * 4,
-    "verdict": {
-        "status": "unsure",
-        "label": "cork",
-        "probability": 0.98765,
-        "scores": [0.98765, 0.01235],
-    },
+    "verdict": dict(status="unsure", label="cork", probability=SHARES[0], scores=[*SHARES]),
     "bundle": "9f3c2a1b",
     "device": {"board": "readout", "serial": "A4", "firmware": [1, 4, 2]},
     "clock": {"jitter_us": 41.23456},
 }
 
 
-def sweep(
-    path: Path,
-    format: SweepFormat,
-    about: dict | None = None,
-    seq: np.ndarray | None = None,
-    **more,
-) -> str:
+def sweep(path: Path, format: SweepFormat, about: dict | None = None, seq=None, **more) -> str:
     """A recording of noise, a second after its start edge, with a silent last taxel."""
     seq = np.arange(format.window) if seq is None else seq
-    taxels = (
-        np.random.default_rng(0)
-        .integers(0, 99, (len(seq), *format.shape))
-        .astype(format.numpy_type)
-    )
+    counts = np.random.default_rng(0).integers(0, 99, (len(seq), *format.shape))
+    taxels = counts.astype(format.numpy_type)
     taxels[:, -1, -1] = 0
     t_ns = (1e9 + seq * format.period_ns).astype(np.int64)
-    made = Sweep(
-        7, 0, int(t_ns[-1]) + 1, Status.OK, Frames(t_ns, seq, taxels), **{"material": "cork"} | more
-    )
-    save(path, made, format, about or {})
+    frames, given = Frames(t_ns, seq, taxels), {"material": "cork"} | more
+    save(path, Sweep(7, 0, int(t_ns[-1]) + 1, Status.OK, frames, **given), format, about or {})
     return str(path)
 
 
@@ -89,9 +74,8 @@ def test_the_picture_says_what_is_known(small: str):
         "the noise of rounding to whole counts; without 1 constant taxel",
     ):
         assert text in shown, text
-    assert {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)} <= set(
-        shown.split("\n")
-    )
+    places = {f"{row},{column}" for row in range(1, 5) for column in range(1, 5)}
+    assert places <= set(shown.split("\n"))
 
 
 @pytest.mark.slow
@@ -162,9 +146,8 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     assert hz[0] == 1
     assert hz[-1] == 375
     assert hz[density.argmax()] == 100
-    assert density.max() == pytest.approx(
-        8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01
-    )  # Hann's noise width is 1.5 bins
+    # Hann's noise width is 1.5 bins
+    assert density.max() == pytest.approx(8 / np.sqrt(2) / np.sqrt(1.5), rel=0.01)
 
 
 @pytest.mark.slow
@@ -219,11 +202,8 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
     """In a constant sweep no frequency has power, and no axis has length zero."""
     format = SweepFormat(2, 2, 100.0, 300, "uint8")
     still = np.full((300, 2, 2), count, np.uint8)
-    save(
-        tmp_path / "a.npy",
-        Sweep(1, 0, 1, Status.OK, Frames(np.arange(300) * 10**7, np.arange(300), still)),
-        format,
-    )
+    frames = Frames(np.arange(300) * 10**7, np.arange(300), still)
+    save(tmp_path / "a.npy", Sweep(1, 0, 1, Status.OK, frames), format)
     shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "a.npy"))))
     assert "no material" in shown
     assert "no spectrum" in shown

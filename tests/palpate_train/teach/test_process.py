@@ -38,16 +38,15 @@ LONG_S = 900
 FORBIDDEN = {"torch", "sklearn", "pandas", "h5py", "joblib", "matplotlib", "skl2onnx", "aeon"}
 
 
+def run(code: str, *words: str | Path | int) -> subprocess.CompletedProcess[str]:
+    """A process of this program."""
+    command, how = [sys.executable, "-c", code, *map(str, words)], {"text": True, "check": False}
+    return subprocess.run(command, cwd=ROOT, capture_output=True, timeout=LONG_S, **how)
+
+
 def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
     """Exit code, printed objects, and the imported packages."""
-    done = subprocess.run(
-        [sys.executable, "-c", WATCHED, *map(str, words)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LONG_S,
-    )
+    done = run(WATCHED, *words)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     return done.returncode, lines, set(done.stderr.split("\n")[-2].split())
 
@@ -132,14 +131,7 @@ def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
     """The model does not fit: the reason is on a line, and nothing is left."""
     lessons.write(tmp_path / "sweeps", easy(8))
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
-    done = subprocess.run(
-        [sys.executable, "-c", limit + WATCHED, tmp_path / "sweeps", "--out", tmp_path / "bundle"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LONG_S,
-    )
+    done = run(limit + WATCHED, tmp_path / "sweeps", "--out", tmp_path / "bundle")
     assert done.returncode
     assert "be written" in json.loads(done.stdout.splitlines()[-1])["text"]
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
@@ -164,14 +156,7 @@ def test_too_little_memory_is_said_before_numpy_is_loaded(
 ):
     """A library that is loaded without room may ask for memory for ever, so nothing is loaded."""
     (tmp_path / "meminfo").write_text(f"MemFree: 3 kB\nMemAvailable: {free_mb << 10} kB\n")
-    words = [tmp_path, "--memory-mb", limit_mb, tmp_path / "meminfo"]
-    done = subprocess.run(
-        [sys.executable, "-c", LOOKED, *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
+    done = run(LOOKED, tmp_path, "--memory-mb", limit_mb, tmp_path / "meminfo")
     assert done.returncode == 1, done.stderr
     assert json.loads(done.stdout)["type"] == "error"
     assert why in json.loads(done.stdout)["text"]

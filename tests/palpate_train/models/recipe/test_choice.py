@@ -392,13 +392,8 @@ def test_a_material_that_a_part_lacks_does_not_set_the_scale():
     given, parts = known()
     lacking = replace(given, labels=np.where(given.labels == 2, 0, given.labels))
     one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
-    factors = [
-        [
-            part.factor
-            for part in HeldOutScores([lacking] * 3, parts, k).score([one, other]).plan.parts
-        ]
-        for k in (2, 3)
-    ]
+    plans = [HeldOutScores([lacking] * 3, parts, k).score([one, other]).plan for k in (2, 3)]
+    factors = [[part.factor for part in plan.parts] for plan in plans]
     np.testing.assert_allclose(factors[0], factors[1], rtol=0.05)
 
 

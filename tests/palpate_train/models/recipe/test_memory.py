@@ -24,12 +24,8 @@ def repeated(times: int) -> Dataset:
     noisy = samples + rng.integers(-2, 3, samples.shape)
     limits = np.iinfo(samples.dtype)
     groups = {"recording": np.arange(len(samples)) // 2}
-    return replace(
-        s,
-        samples=noisy.clip(limits.min, limits.max).astype(samples.dtype),
-        labels=np.tile(s.labels, times),
-        groups=groups,
-    )
+    noisy = noisy.clip(limits.min, limits.max).astype(samples.dtype)
+    return replace(s, samples=noisy, labels=np.tile(s.labels, times), groups=groups)
 
 
 def peak(sweeps: Dataset) -> int:
