@@ -39,7 +39,7 @@ ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2",
 EXTRAS = {
     "web": {"tornado"},
     "bridges/mqtt.py": {"paho"},
-    "service/network.py": {"zeroconf"},
+    "service/network.py": {"zeroconf", "ifaddr"},
     "bridges/opcua.py": {"asyncua"},
     "bridges/opcua_model.py": {"asyncua"},
     "bridges/opcua_security.py": {"asyncua", "cryptography"},

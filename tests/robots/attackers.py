@@ -1,9 +1,9 @@
 """Hostile programs, and good ones, at a bridge, at the page or at the feed: `python -m
 tests.robots.attackers KIND WHERE`, until standard input ends.
 
-KIND is modbus, tcp, page or feed, WHERE its port on loopback or its local socket. Prints a line of
-JSON with the number of connections and the answers that good peers got. All peers are in one
-process of low priority. It pauses between its rounds, so it takes less than a core.
+KIND is modbus, opcua, tcp, page or feed, WHERE its port on loopback or its local socket. Prints a
+line of JSON with the number of connections and the answers that good peers got. All peers are in
+one process of low priority. It pauses between its rounds, so it takes less than a core.
 """
 
 import json
@@ -11,6 +11,7 @@ import os
 import random
 import select
 import socket
+import struct
 import sys
 import time
 from collections import Counter
@@ -23,9 +24,17 @@ from palpate.core.sentences import sentence
 
 READ = bytes.fromhex("000100000006ff0400000028")
 """A request of Modbus TCP for all registers."""
+HELLO = b"HELF" + struct.pack("<7I", 32, 0, 65535, 65535, 1 << 20, 17, 0)
+"""The first message of OPC UA, with an empty URL; it is answered."""
 ASK = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 FLOODS = {
     "modbus": (READ * 50, b"\0\1\0\0\0\xff"),
+    "opcua": (
+        HELLO,
+        HELLO * 50,
+        HELLO + b"OPNF" + struct.pack("<2I", 200, 0) + b"\xff" * 192,
+        b"MSGF" + struct.pack("<I", 0xFFFFFFF0) + b"\0" * 3000,
+    ),
     "tcp": (
         sentence("STATE") * 20,
         sentence("START") * 20 + sentence("ABORT") * 20,
@@ -41,8 +50,14 @@ FLOODS = {
     ),
 }
 """Bytes that are sent without end: valid, refused, endless and wrong requests."""
-HALVES = {"modbus": READ[:7], "tcp": b"$PPLP,STA", "page": ASK[:20], "feed": b'{"fra'}
-GOOD = {"modbus": READ, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
+HALVES = {
+    "modbus": READ[:7],
+    "opcua": HELLO[:9],
+    "tcp": b"$PPLP,STA",
+    "page": ASK[:20],
+    "feed": b'{"fra',
+}
+GOOD = {"modbus": READ, "opcua": HELLO, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
 ALL = b'{"frames": 20, "sweeps": true}\n'
 BURSTS = {"feed": 20}
 """Connections of a storm in a round; elsewhere 2."""

@@ -31,8 +31,9 @@ from palpate.core.log import SparseLog
 
 KEPT = 1000
 """Values that wait for a subscriber."""
-MOST_BYTES = 1 << 20
-"""Longest message of a client; also the bytes of one that is not complete."""
+MOST_MESSAGE, MOST_BYTES, MOST_WAITING = 1 << 20, 1 << 17, 64
+"""Of a client: its longest message, the bytes of a part that is not complete, and the parts that
+wait. Each of them holds all bytes that came with it."""
 PACE_S = 0.005
 """Pause after each piece that a client sends, so that a flood leaves the other programs of the
 computer their share."""
@@ -132,15 +133,17 @@ def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes]:
 def limit(server: Server, most: int, *, users: bool, anonymous: bool) -> None:
     """Set who may do what, and how much of it. most: connections at a time. users: whether there is
     a login."""
-    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # hostile bytes would fill the log
+    for name, level in (("asyncua", logging.CRITICAL), ("asyncio", logging.ERROR)):
+        logging.getLogger(name).setLevel(level)  # hostile bytes would fill the log
     secure = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
     # the second is needed for discovery; Login refuses sessions there
     server.set_security_policy([secure, ua.SecurityPolicyType.NoSecurity], ReadersAndUsers())
     tokens: list[type] = [ua.UserNameIdentityToken] * users
     server.set_identity_tokens(tokens + [ua.AnonymousIdentityToken] * anonymous)
-    server.limits = TransportLimits(65_535, 65_535, 17, MOST_BYTES)
+    server.limits = TransportLimits(65_535, 65_535, 17, MOST_MESSAGE)
     inner, service = server.iserver, server.iserver.subscription_service
     inner.max_connections, inner.max_pending_activation_seconds = most, ACTIVATED_S
+    inner.max_pending_messages_per_connection = MOST_WAITING
     inner.max_subscriptions, inner.max_session_timeout_ms = SUBSCRIPTIONS, SESSION_MS
     inner.max_unacked_messages_per_subscription = UNREAD
     inner.max_monitored_item_queue_size = KEPT

@@ -47,6 +47,14 @@ def local(host: str) -> bool:
     return ip_address(host).is_loopback
 
 
+def own_addresses() -> list[str]:
+    """The IPv4 addresses of this computer."""
+    import ifaddr
+
+    every = [ip for card in ifaddr.get_adapters() for ip in card.ips]
+    return [str(ip.ip) for ip in every if ip.is_IPv4]
+
+
 def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], None]:
     """Announce a port that is open, in a thread of its own; returns a function that ends it.
 
@@ -69,7 +77,7 @@ def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], No
             every = ip_address(host).is_unspecified
             one = zeroconf.Zeroconf(zeroconf.InterfaceChoice.All if every else [host])
             opened.append(one)
-            hosts = zeroconf.get_all_addresses() if every else [host]
+            hosts = own_addresses() if every else [host]
             one.register_service(_info(f"{box}-{own}", kind, hosts, port), allow_name_change=True)
         except (OSError, zeroconf.Error) as e:
             log.warning(f"{kind}: not announced ({e}); give its address to the clients")
