@@ -15,6 +15,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data import sets
+from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, uncertainty
 from palpate_train.evaluate.evaluate import Plan, Where
@@ -88,7 +89,10 @@ def curve(
     both = sets.join([train, test])
     counts = np.bincount(train.labels, minlength=len(train.materials))
     points = []
-    for each in [*(size for size in SIZES if size < counts.min()), 0]:
+    sizes = [*(size for size in SIZES if size < counts.min()), 0]
+    progress = Progress(len(sizes), log)
+    for each in sizes:
+        progress.begin(f"learning curve, {each or round(counts.mean())} sweeps of each material")
         plan = Plan((method,), (SPLIT,), (1,), effort=effort, each=each)
         for result in evaluate.evaluate(both, plan, where, log):
             if result.refused:
