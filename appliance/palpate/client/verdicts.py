@@ -96,7 +96,8 @@ class VerdictFile:
         """Raises sqlite3.DatabaseError."""
         # psow=0: a power cut in a write may spoil its whole sector, and with it the end of the
         # verdict before; so SQLite fills the sector
-        url = f"{self._path.absolute().as_uri()}?psow=0"
+        none = str(self._path) == ":memory:"
+        url = f"{'file::memory:' if none else self._path.absolute().as_uri()}?psow=0"
         db = sqlite3.connect(url, timeout=WAIT_S, uri=True, check_same_thread=False)
         try:
             db.execute("PRAGMA journal_mode = WAL")
