@@ -24,9 +24,14 @@ def run(args: argparse.Namespace) -> int:
         return show_network(as_json=args.json)
     if args.since is not None:
         return show_since(args)
-    folder = settings_files.runtime(
-        settings_files.read(args.board, args.set, folder=args.config_dir)
-    )
+    if args.unit:  # its folder has its name, and its settings a file of their own
+        from palpate.cli.common import load_settings
+
+        folder = load_settings(args).store.runtime_folder
+    else:
+        folder = settings_files.runtime(
+            settings_files.read(args.board, args.set, folder=args.config_dir)
+        )
     if folder is None:
         raise ConfigError(
             'store.runtime = "" turns the status file off; set it to a folder, and restart the'
