@@ -54,12 +54,14 @@ def run_watch(args: argparse.Namespace) -> int:
     socket, stopped = settings.store.needed_feed(), StopFlag()
     if args.web is not None:
         from palpate.web.access import Access
+        from palpate.web.boxes import OtherBoxes
         from palpate.web.history import History
         from palpate.web.web import PageWatcher
 
         access = Access.configured(settings.watch, args.web)
         history = History(Path(settings.bridge.memory), settings.watch.shifts)
-        given = str(socket), access, clock.now_ns, history, args.unit or ""
+        others = OtherBoxes(clock) if access.tokens else tuple  # on this machine alone: none
+        given = str(socket), access, clock.now_ns, history, args.unit or "", others
         watcher = retried(lambda: PageWatcher(*given), clock, stopped)
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)

@@ -21,7 +21,7 @@ browsers see that this program runs."""
 
 
 Found = Callable[[], Sequence[Mapping[str, str]]]
-"""Other boxes of the site, each with `name` and `address` of its page. It does not wait."""
+"""Other boxes of the site, each with `name` and `address` of its page."""
 
 
 class PageWatcher:

@@ -54,6 +54,17 @@ def test_what_is_written_is_read(path):
     assert {type(row["probability"]) for row in beside} == {float}
 
 
+def test_no_file_is_made_of_what_is_kept_in_memory(tmp_path, monkeypatch):
+    """Each has rows of its own, which end with it."""
+    monkeypatch.chdir(tmp_path)
+    for sweep in (1, 2):
+        kept = VerdictFile(Path(":memory:"))
+        kept.add(NOW, verdict(sweep))
+        assert [row["sweep"] for row in since(kept.db, NOW)] == [sweep]
+        kept.close()
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_a_killed_writer_loses_nothing(path):
     """SIGKILL at any moment: all verdicts that were written are there, and the file is sound."""
