@@ -21,7 +21,7 @@ from palpate_train.export import measure
 from palpate_train.metrics import score
 from palpate_train.models.recipe import graph, recipe, relations
 from palpate_train.models.recipe.architectures import STAGES, Architecture
-from palpate_train.models.recipe.bank import Bank
+from palpate_train.models.recipe.bank import POOLS, Bank
 from palpate_train.models.recipe.recipe import FIXED, Settings, Trunk
 from palpate_train.onnx_tools.graph_builder import slim, with_head
 
@@ -85,8 +85,8 @@ def alone(sweeps: Dataset) -> Mapping[str, Trunk]:
     filters = dict(every.weights) | bank.take(spread).weights()
     plain = replace(FIXED, mains_hz=every.architecture.mains_hz)
     views = {
-        "filters": replace(plain, pools=1),
-        "shares": replace(plain, pools=2),
+        "filters": replace(plain, pools=("magnitudes",)),
+        "shares": replace(plain, pools=POOLS),
         "distribution": replace(plain, distribution=True),
         "spectrum": replace(plain, spectrum=True),
         "few relations": replace(plain, relations=relations.SHORT),
@@ -136,8 +136,8 @@ def choices(run: StudyRun) -> Iterator[Json]:
 def views_of(architecture: Architecture) -> list[str]:
     """The names of the views that a trunk has."""
     there = {
-        "filters": architecture.pools > 0,
-        "shares": architecture.pools > 1,
+        "filters": "magnitudes" in architecture.pools,
+        "shares": "shares" in architecture.pools,
         "distribution": architecture.distribution,
         "spectrum": architecture.spectrum,
         "relations": architecture.relations > 0,

@@ -11,7 +11,7 @@ from palpate.sim import skin
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe import graph, recipe
 from palpate_train.models.recipe.architectures import STAGES
-from palpate_train.models.recipe.bank import LEAST_FILTERS, Bank
+from palpate_train.models.recipe.bank import LEAST_FILTERS, POOLS, Bank
 from palpate_train.onnx_tools.graph_builder import with_head
 from palpate_train.onnx_tools.quantize import quantize
 
@@ -36,7 +36,7 @@ def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     stages = StagesNetwork(format, classes, trunk.scale, norm=False).weights()
     filters = Bank.of(trunk.weights)
     filters = filters.take(np.arange(len(filters))[:: len(filters) // LEAST_FILTERS])
-    architecture = replace(STAGES, pools=2, distribution=True, spectrum=True)
+    architecture = replace(STAGES, pools=POOLS, distribution=True, spectrum=True)
     small = graph.trunk_graph(
         format, trunk.scale, {**trunk.weights, **stages, **filters.weights()}, architecture
     )

@@ -26,7 +26,7 @@ FORMATS = [
 MANY = SweepFormat(8, 10, 100.0, 160, "uint8")
 LONG = SweepFormat(1, 1, 2200.0, 8800, "uint8")
 forms = pytest.mark.parametrize("format", FORMATS, ids=str)
-BANK = replace(FIXED, pools=2)
+BANK = replace(FIXED, pools=bank.POOLS)
 
 
 def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
@@ -56,13 +56,17 @@ def small(format: SweepFormat, architecture: Architecture = BANK) -> Bank:
 
 
 def trunk(
-    format: SweepFormat, filters: Bank, int8: bool, prefixes: bool = False
+    format: SweepFormat,
+    filters: Bank,
+    int8: bool,
+    prefixes: bool = False,
+    pools: tuple[str, ...] = bank.POOLS,
 ) -> onnx.ModelProto:
     """The trunk of these filters alone."""
-    given = counts(format, 12)
-    ranges = graph.Ranges(graph.count_range(given, BANK), ()) if int8 else None
+    given, seen = counts(format, 12), replace(BANK, pools=pools)
+    ranges = graph.Ranges(graph.count_range(given, seen), ()) if int8 else None
     return graph.trunk_graph(
-        format, texture_scale(given), filters.weights(), BANK, ranges, prefixes
+        format, texture_scale(given), filters.weights(), seen, ranges, prefixes
     )
 
 
@@ -104,6 +108,16 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepForma
         prefixes = run(trunk(format, filters, int8, prefixes=True), given)
         assert prefixes.shape == (len(given), 10, whole.shape[1])
         np.testing.assert_allclose(prefixes[:, -1], whole, atol=1e-5)
+
+
+@pytest.mark.parametrize("int8", [False, True])
+def test_one_pool_alone_is_its_part_of_both(int8: bool):
+    """A head may see magnitudes or shares alone."""
+    format, given = FORMATS[0], counts(FORMATS[0])
+    filters = small(format)
+    both = run(trunk(format, filters, int8), given)
+    alone = [run(trunk(format, filters, int8, pools=(pool,)), given) for pool in bank.POOLS]
+    np.testing.assert_array_equal(np.concatenate(alone, axis=1), both)
 
 
 def test_wide_counts_keep_what_a_byte_would_round_away():

@@ -481,3 +481,36 @@ def test_worse_is_more_than_chance():
     assert at.paired(spoiled_by(40), one).worse
     assert not at.paired(one, one).worse
     assert not at.paired(one, spoiled_by(40)).worse
+
+
+@pytest.mark.parametrize(
+    ("won", "saved", "carries"),
+    [
+        ([30, 0, 0], 1.0, True),
+        ([30, 0, 0], -1.0, False),
+        ([3, 0, 0], 1.0, False),
+        ([40, 0, -10], 1.0, False),
+    ],
+)
+def test_one_part_may_show_what_carries_over(won: list[int], saved: float, carries: bool):
+    """Of a hundred sweeps in each part, so many more are classified correctly: the outermost value
+    alone may show the gain, but not against the loss, by chance, or at the cost of a group."""
+    gain = np.concatenate([np.sign(n) * (np.arange(100) < abs(n)) for n in won]) / 300
+    parts = np.repeat(np.arange(3), 100)
+    groups = [(parts < 2, np.full(200, 1 / 300)), (parts == 2, np.full(100, 1 / 300))]
+    found = choice.PairedDifference(gain, np.full(300, saved / 300), parts, groups)
+    assert found.carries is carries
+    assert not found.better
+
+
+def test_shares_and_few_scales_take_the_place_of_magnitudes_that_mislead():
+    """Magnitudes name the material in one group alone, shares and relations in each."""
+    given, parts = known(600)
+    rng, own = np.random.default_rng(5), given.features[:, GOOD]
+    views = [own + 2.5 * rng.standard_normal((600, 2)) for _ in range(4)]
+    x = np.hstack([given.features[:, TRAP], *views]).astype(np.float32)
+    at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
+    offered = candidates([[0]], [0], [1], levels=(3, 4), relations=[[5, 6], [7, 8]])
+    chosen = choice.choose(at, offered, print)
+    assert 0 not in chosen.plan.columns()
+    assert {1, 3, 5} <= set(chosen.plan.columns().tolist())

@@ -61,12 +61,11 @@ class Architecture:
     first stage for long windows.
 
     planned: number of stages for which a trunk without stages prepares counts. spectrum: whether
-    the head sees the bands of spectrum.py after all other features. pools: pooling of the filter
-    bank of bank.py: 0 without a bank, 1 by magnitudes, 2 by shares as well. distribution: whether
-    the head sees the shares of distribution.py. loads: whether it sees those of loads.py.
-    relations: number of scales of relations.py that it sees. slow: whether it sees the waves of
-    slow.py. mains_hz: frequency of the mains, to
-    whose hum stages and spectrum do not respond.
+    the head sees the bands of spectrum.py after all other features. pools: some of bank.POOLS, what
+    it sees of the filter bank of bank.py. distribution: whether it sees the shares of
+    distribution.py. loads: whether it sees those of loads.py. relations: number of scales of
+    relations.py that it sees. slow: whether it sees the waves of slow.py. mains_hz: frequency of
+    the mains, to whose hum stages and spectrum do not respond.
     """
 
     channels: tuple[int, ...]
@@ -74,7 +73,7 @@ class Architecture:
     stride: int = 4
     planned: int = 0
     spectrum: bool = False
-    pools: int = 0
+    pools: tuple[str, ...] = ()
     distribution: bool = False
     loads: bool = False
     relations: int = 0

@@ -26,6 +26,9 @@ from palpate_train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
 from palpate_train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
+POOLS = "magnitudes", "shares"
+"""The features of a filter: the logarithm of its mean magnitude, and the share of its responses
+above a threshold."""
 TAPS, DILATED, PART = 9, 16, 16
 """Taps of a filter in time. A dilation is at most DILATED or, in long windows, a PART of the
 window; the filters then span half of it."""
@@ -188,11 +191,11 @@ def groups(bank: Bank) -> list[tuple[Array, int]]:
 
 @dataclass(frozen=True)
 class Pooling:
-    """The pooling of responses. int8: in integers. shares: beside magnitudes. prefixes: for each
+    """The pooling of responses. int8: in integers. pools: some of POOLS. prefixes: for each
     prefix. rowwise: each prefix has a row of its own."""
 
     int8: bool
-    shares: bool
+    pools: tuple[str, ...]
     prefixes: bool = False
     rowwise: bool = False
 
@@ -236,8 +239,8 @@ def _taps(g: GraphBuilder, bank: Bank, step: float, int8: bool) -> str:
 def pooled(
     g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
 ) -> list[str]:
-    """Taxels as for `responses` -> log mean magnitudes [1, 1 or PREFIXES, F], and with `shares` the
-    shares above the thresholds in the same shape."""
+    """Taxels as for `responses` -> log mean magnitudes, and shares above the thresholds, each
+    [1, 1 or PREFIXES, F]; only those that `how` has."""
     y, stages = responses(g, format, bank, x, step, how.int8)
     counts = np.array([shape.known_steps(format.window, how.prefixes) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)
@@ -252,11 +255,14 @@ def pooled(
         )
         return g("ReduceSum", g("Mul", total, weights), g.constant([1], "int64"))
 
-    size = g("Sub", *map(mean, _sides(g, y))) if how.int8 else mean(g("Abs", y))
-    size = g("Mul", size, g.constant(bank.reach / (MIDDLE - 1 if how.int8 else 1)))
-    found = [g("Log", g("Add", size, g.constant(FLOOR)))]
-    found += [mean(_above(g, y, bank.limits, how.int8))] if how.shares else []
-    return [g("Transpose", part, perm=[1, 0, 2]) for part in found]
+    def magnitudes() -> str:
+        size = g("Sub", *map(mean, _sides(g, y))) if how.int8 else mean(g("Abs", y))
+        size = g("Mul", size, g.constant(bank.reach / (MIDDLE - 1 if how.int8 else 1)))
+        return g("Log", g("Add", size, g.constant(FLOOR)))
+
+    made = (magnitudes, lambda: mean(_above(g, y, bank.limits, how.int8)))
+    kinds = [make for name, make in zip(POOLS, made, strict=True) if name in how.pools]
+    return [g("Transpose", make(), perm=[1, 0, 2]) for make in kinds]
 
 
 def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:

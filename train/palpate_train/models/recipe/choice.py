@@ -199,6 +199,15 @@ class PairedDifference:
         return self._clear(self.saved) and alike and not self.worse
 
     @property
+    def carries(self) -> bool:
+        """A lower loss, a higher accuracy by more than ERRORS standard errors over sweeps, and no
+        group is less accurate by more than one. Parts may differ: an outermost value shows more of
+        what a new one does than all others."""
+        alike = all(self.won[of].sum() >= -_error(self.won[of]) for of, _ in self.groups)
+        gain = self.won.sum() > ERRORS * _error(self.won)
+        return bool(self.saved.sum() > 0 and gain and alike)
+
+    @property
     def holds(self) -> bool:
         """At most MOST_LOST less accuracy, one standard error or one sweep included, and at most
         MOST_WORSE more loss. No group may lose more than MOST_LOST either: an easier group does
@@ -358,6 +367,19 @@ class Candidates:
         views = dict.fromkeys((head(of.relations[: relations.SHORT]), head(of.relations)))
         return {"relations beside filters": (*filters, *views)}
 
+    def steady(self, best: Heads) -> dict[str, Heads]:
+        """Shares, distribution, and one and few scales of the relations, a discriminant each: they
+        carry over to a new speed, and magnitudes in the same sum would outvote them."""
+        of = self.columns
+        if not (of.relations.size and len(of.shares) and len(of.levels)):
+            return {}
+        views = (of.shares, 1.0), (of.levels, 1.0), (of.relations[:1], 1.0)
+        heads = [
+            HeadPart(tuple(view.ravel().tolist()), best[0].copies, weight=weight)
+            for view, weight in (*views, (of.relations[: relations.SHORT], float(len(views) - 1)))
+        ]
+        return {"without magnitudes, with few scales": tuple(heads)}
+
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
         loads = self.columns.loads
@@ -388,6 +410,7 @@ class Candidates:
 STEPS: tuple[tuple[str, Callable[[PairedDifference], bool]], ...] = (
     ("extended", lambda found: found.better),
     ("related", lambda found: found.helps or found.better),
+    ("steady", lambda found: found.carries),
     ("loaded", lambda found: found.helps),
 )
 """The methods of Candidates that add to the choice so far, and when the best of theirs takes its

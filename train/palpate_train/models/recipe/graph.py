@@ -107,8 +107,7 @@ def layout(
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
-        "magnitudes": filters,
-        "shares": filters * (architecture.pools > 1),
+        **{pool: filters * (pool in architecture.pools) for pool in bank.POOLS},
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "loads": architecture.loads * loads.count(format),
         "relations": architecture.relations * relations.each(format),
@@ -179,7 +178,7 @@ class _TrunkNodes:
     def bank(self, weights: Mapping[str, Array]) -> list[str]:
         """See bank.pooled."""
         pools, int8 = self._architecture.pools, self._own is not None
-        how = bank.Pooling(int8, pools > 1, self._prefixes, self._rowwise)
+        how = bank.Pooling(int8, pools, self._prefixes, self._rowwise)
         taxels = self.prepared(self._own)
         filters = bank.Bank.of(weights)
         return bank.pooled(self.g, self._format, filters, taxels.x, taxels.step, how)

@@ -364,25 +364,24 @@ def with_stages(
 def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
     """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
     it."""
-    size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
-    filters, shares, levels, loads, related, waves, bands = (
-        used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
-        for part in (
-            layout.get(k, slice(0, 0))
-            for k in ("magnitudes", "shares", "levels", "loads", "relations", "slow", "bands")
-        )
-    )
+    size, used = sum(STAGES.channels) if stages else 0, plan.columns()
+    seen = {
+        name: used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
+        for name, part in fixed.layout().items()
+    }
+    seen = {name: numbers for name, numbers in seen.items() if len(numbers)}
+    pools = tuple(name for name in bank.POOLS if name in seen)
     architecture = replace(
         stages.architecture if stages else fixed.architecture,
-        pools=(len(filters) > 0) + (len(shares) > 0),
-        distribution=len(levels) > 0,
-        loads=len(loads) > 0,
-        relations=len(related) // relations.each(fixed.sweeps.format),
-        slow=len(waves) > 0,
-        spectrum=len(bands) > 0,
+        pools=pools,
+        distribution="levels" in seen,
+        loads="loads" in seen,
+        relations=len(seen.get("relations", ())) // relations.each(fixed.sweeps.format),
+        slow="slow" in seen,
+        spectrum="bands" in seen,
     )
     weights = dict(stages.weights) if stages else {}
-    weights |= Bank.of(fixed.weights).take(filters).weights() if architecture.pools else {}
+    weights |= Bank.of(fixed.weights).take(seen[pools[0]]).weights() if pools else {}
     weights |= distribution.Levels.of(fixed.weights).weights() if architecture.distribution else {}
     ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
     return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
@@ -434,7 +433,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     architecture = replace(
         FIXED,
         spectrum=spectrum.count(format) > 0,
-        pools=2,
+        pools=bank.POOLS,
         distribution=True,
         loads=True,
         relations=relations.scales(format),
@@ -482,7 +481,7 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
         for free, name in ((False, "zero-sum"), (True, "free"))
         if (filters == free).any()
     ]
-    words += ["magnitudes and shares" if pools > 1 else "magnitudes"] * (len(filters) > 0)
+    words += [" and ".join(pools)] * (len(pools) > 0)
     words += ["distribution"] * trunk.architecture.distribution
     words += ["loads"] * trunk.architecture.loads
     scales = trunk.architecture.relations
