@@ -89,7 +89,7 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path):
             capture_output=True,
             text=True,
             check=False,
-            timeout=120,
+            timeout=600,
         )
         assert done.returncode == 0, done.stderr
         output += done.stdout
