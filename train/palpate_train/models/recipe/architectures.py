@@ -61,8 +61,8 @@ class Architecture:
     first stage for long windows.
 
     planned: number of stages for which a trunk without stages prepares counts. spectrum: whether
-    the head sees the bands of spectrum.py after all other features. pools: some of bank.POOLS, what
-    it sees of the filter bank of bank.py. distribution: whether it sees the shares of
+    the head sees the bands of spectrum.py after all other features. pools: the features of
+    the filter bank that it sees, some of bank.POOLS. distribution: whether it sees the shares of
     distribution.py. loads: whether it sees those of loads.py. relations: number of scales of
     relations.py that it sees. slow: whether it sees the waves of slow.py. mains_hz: frequency of
     the mains, to whose hum stages and spectrum do not respond.

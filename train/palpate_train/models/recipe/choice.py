@@ -201,8 +201,8 @@ class PairedDifference:
     @property
     def carries(self) -> bool:
         """A lower loss, a higher accuracy by more than ERRORS standard errors over sweeps, and no
-        group is less accurate by more than one. Parts may differ: an outermost value shows more of
-        what a new one does than all others."""
+        group is less accurate by more than one. Parts may differ: an outermost value is most
+        like a new one."""
         alike = all(self.won[of].sum() >= -_error(self.won[of]) for of, _ in self.groups)
         gain = self.won.sum() > ERRORS * _error(self.won)
         return bool(self.saved.sum() > 0 and gain and alike)
