@@ -51,8 +51,8 @@ class HeldOutScores:
     known: the data that heads are fitted to, for each part the same sweeps in the same order; their
     features may differ, if a trunk was trained without the part. copied: score augmented copies of
     the held-out sweeps as well, which then count as much as these. labels, clusters: of everything
-    that is scored [n]; a cluster is the number of a part. groups: text [n], what the part leaves
-    out. own: bool [n], True for a sweep and False for a copy.
+    that is scored [n]; a cluster is the number of a part. groups: text [n], left out by the
+    part. own: bool [n], True for a sweep and False for a copy.
     """
 
     def __init__(
@@ -201,8 +201,8 @@ class PairedDifference:
     @property
     def carries(self) -> bool:
         """A lower loss, a higher accuracy by more than ERRORS standard errors over sweeps, and no
-        group is less accurate by more than one. Parts may differ: an outermost value is most
-        like a new one."""
+        group is less accurate by more than one. Parts may differ: outermost values
+        show most."""
         alike = all(self.won[of].sum() >= -_error(self.won[of]) for of, _ in self.groups)
         gain = self.won.sum() > ERRORS * _error(self.won)
         return bool(self.saved.sum() > 0 and gain and alike)
@@ -335,7 +335,7 @@ class Candidates:
         }
 
     def reduced(self) -> dict[str, Callable[[Heads], Heads]]:
-        """What the usual candidate may lack: each changes heads to heads without it."""
+        """Views to leave out of the usual candidate: each changes heads to heads without it."""
         views = {"distribution": self.columns.levels, "spectrum": self.columns.bands}
         without: dict[str, Callable[[Heads], Heads]] = {
             f"without {name}": partial(_without, columns=columns)
@@ -389,7 +389,7 @@ class Candidates:
         return {"with loads beside": (*best, alone), "with loads in each": _with(best, loads)}
 
     def beside(self, best: Heads) -> dict[str, Heads]:
-        """What joins the best candidate unless it makes it worse: a discriminant of the slow waves,
+        """Joins the best candidate unless it makes it worse: a discriminant of the slow waves,
         which counts as much as all others together. On a skin that is put back the waves move from
         taxel to taxel."""
         slow = self.columns.slow
