@@ -45,7 +45,7 @@ TOPICS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShownSweep:
+class SweepToWrite:
     """A sweep. taxels: [T, R, C] or [T, R, C, A] raw counts. t_ns: [T] from its first frame on.
     verdict: as the box wrote it, {} for none."""
 
@@ -86,7 +86,7 @@ def _channel(writer: Any, topic: str) -> int:
     return int(writer.register_channel(topic, "json", known))
 
 
-def _sweeps(source: str) -> Iterator[ShownSweep]:
+def _sweeps(source: str) -> Iterator[SweepToWrite]:
     folder = Path(source)
     if folder.is_dir():
         for one in readers.read_recorded(folder):
@@ -94,15 +94,15 @@ def _sweeps(source: str) -> Iterator[ShownSweep]:
             if len(frames):
                 t_ns = frames.t_ns - frames.t_ns[0]
                 verdict = dict(one.about.get("verdict", {}))
-                yield ShownSweep(frames.taxels, t_ns, one.sweep.material, verdict)
+                yield SweepToWrite(frames.taxels, t_ns, one.sweep.material, verdict)
         return
     found = sets.load(source)
     t_ns = np.rint(1e9 / found.rate_hz * np.arange(found.format.window)).astype(np.int64)
     for taxels, label in zip(found.samples, found.labels, strict=True):
-        yield ShownSweep(taxels, t_ns, str(found.materials[label]), {})
+        yield SweepToWrite(taxels, t_ns, str(found.materials[label]), {})
 
 
-def _messages(sweep: ShownSweep) -> Iterator[tuple[str, int, dict[str, Any]]]:
+def _messages(sweep: SweepToWrite) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time in ns and content, in the order of their times."""
     yield "/trigger", 0, {"data": "START"}
     if sweep.material:
