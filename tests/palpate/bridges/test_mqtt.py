@@ -279,5 +279,4 @@ def test_discovery_has_what_home_assistant_asks_for():
 def test_nobody_listens_at_the_port(box, caplog):
     """A warning says where, and the bridge goes on trying."""
     with bridge("mqtt", "--port", str(box.path), "--broker", f"mqtt://127.0.0.1:{free_port()}"):
-        eventually(lambda: "refused" in caplog.text)
-        assert "--login" in caplog.text
+        eventually(lambda: "--login" in caplog.text)
