@@ -15,6 +15,7 @@ import numpy as np
 from palpate.client.answers import Answer
 from palpate.core.clock import Clock
 from palpate.sim import rig, script, skin
+from tests.rig.lines import GuestLines
 from tests.rig.machine import Guest
 
 FIFO = 22_500
@@ -50,7 +51,7 @@ class Touch:
 class CellRobot:
     """The script that a board plays: an empty skin, and a touch on request (see sim.rig.Robot)."""
 
-    def __init__(self, lines: rig.EdgeLines, clock: Clock, seed: int) -> None:
+    def __init__(self, lines: GuestLines, clock: Clock, seed: int) -> None:
         self.skipped = None
         self.touches: queue.SimpleQueue[Touch] = queue.SimpleQueue()
         self._lines, self._clock, self._rng = lines, clock, np.random.default_rng(seed)

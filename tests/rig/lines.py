@@ -22,7 +22,7 @@ class GuestLines:
     """levels: the level that the box drives, by line name. log: (ns, name, level) of all changes,
     in order, with the time that was read last.
 
-    Can be used as the lines of the rig's robot (palpate.sim.rig.EdgeLines).
+    Can be used as the lines of the rig's robot (palpate.sim.rig.Robot).
     """
 
     def __init__(self, qtest: Qtest, clock: GuestClock, place: str, names: Sequence[str]) -> None:

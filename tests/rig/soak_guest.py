@@ -24,6 +24,7 @@ from palpate.sim import rig, script, skin
 from tests.factories.emulated_machines import LOCK
 from tests.rig import image
 from tests.rig.cell import IDLE
+from tests.rig.lines import GuestLines
 from tests.rig.machine import Guest
 from tests.rig.shell import GuestFailed
 from tests.rig.soak_boxes import Gone, Script, process
@@ -43,7 +44,7 @@ class SoakRobot:
     frames are fetched.
     """
 
-    def __init__(self, lines: rig.EdgeLines, seed: int) -> None:
+    def __init__(self, lines: GuestLines, seed: int) -> None:
         self.skipped = None
         self.ready = threading.Event()
         self.edges_ns: tuple[list[int], list[int]] = ([], [])
