@@ -16,6 +16,7 @@ from palpate_train.evaluate.evaluate import Where
 from palpate_train.export import measure
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.architectures import Architecture
+from palpate_train.models.recipe.bank import POOLS
 from palpate_train.models.recipe.recipe import Settings
 from palpate_train.models.recipe.sizes import UNLIMITED
 
@@ -70,7 +71,7 @@ def test_each_set_is_fitted_once(monkeypatch: pytest.MonkeyPatch):
 def test_views_are_read_from_the_trunk():
     """Each part of an architecture is a view; a trunk of the spectrum has one."""
     assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
-    every = Architecture((4,), 8, 2, 0, True, 2, True, True, 3)
+    every = Architecture((4,), 8, 2, 0, True, POOLS, True, True, 3)
     assert recipe_views.views_of(every) == list(recipe_page.VIEWS)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from palpate.core.disk_thread import AtOnce, DiskWork
 from palpate.core.errors import ApplianceError, BundleError
@@ -21,15 +21,31 @@ from palpate.core.status import Status
 from palpate.deployment.state import STATE_FILE
 
 if TYPE_CHECKING:
+    from palpate.core.config import StoreConfig
     from palpate.core.health import Health
     from palpate.core.types import Verdict
     from palpate.deployment.state import Standing
-    from palpate.deployment.store import Store
 
 RETRY_NS = 10_000_000_000
 """Pause after a failed write."""
 ERRORS = (OSError, ApplianceError)
 """Errors of a write to the store: of the disk, or because another command holds the lock."""
+
+
+class TrialStore(Protocol):
+    """The part of the store that a trial uses. Both methods raise OSError or ApplianceError if
+    nothing could be written."""
+
+    @property
+    def settings(self) -> StoreConfig:
+        """Settings with the number of sweeps and seconds of a trial."""
+
+    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
+        """Record the progress of the trial of `sha`, and whether this start counts in
+        `starts`."""
+
+    def commit(self, sha: str | None, wait_s: float) -> bool:
+        """End the trial of `sha`. Returns whether it was on trial."""
 
 
 class Trial(Observer):
@@ -42,7 +58,7 @@ class Trial(Observer):
 
     disk: DiskWork = AtOnce()
 
-    def __init__(self, store: Store, sha: str, standing: Standing) -> None:
+    def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
         self._store, self._sha = store, sha
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)

@@ -82,3 +82,30 @@ class TransferObserver(Protocol):
     def state(self, t_ns: int, state: str) -> None:
         """The sensor's state has changed, or the skin was opened (OPENED)."""
         ...
+
+
+class FrameStream(Protocol):
+    """Converts the bytes of a skin to Frames with numbers and host times, without I/O."""
+
+    @property
+    def loss_known(self) -> bool:
+        """Whether every lost frame is seen, as the skin counts its frames."""
+        ...
+
+    @property
+    def clock(self) -> dict[str, float] | None:
+        """Accuracy of the times: DeviceClock.quality."""
+        ...
+
+    @property
+    def misfit(self) -> str:
+        """Why bytes are not frames, and the remedy, as far as it shows; "" if it does not."""
+        ...
+
+    def restart(self) -> None:
+        """Begin an enumeration: frame numbers get the next epoch, the clock starts again."""
+        ...
+
+    def feed(self, data: bytes, arrival_ns: int) -> Frames:
+        """The frames in bytes that were read until `arrival_ns`. Raises SensorMismatch."""
+        ...

@@ -21,7 +21,7 @@ from palpate.core.errors import SensorMismatch
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from palpate.io import packets, skin_codecs
 from palpate.io.link import TTY_BYTES
-from palpate.io.sensor import SensorCounters
+from palpate.io.sensor import FrameStream, SensorCounters
 from palpate.io.skin_codecs import Codec, Decoded, Rest
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.usb_sensor import Stream
@@ -239,9 +239,6 @@ class CountedStream:
                 f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected"
                 f" ({share}); set skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
             )
-
-
-FrameStream = Stream | CountedStream
 
 
 def proven_s(format: SweepFormat) -> float:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,10 +28,7 @@ from palpate.core.errors import (
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat, shown
 from palpate.io import packets
 from palpate.io.link import Readable, SkinLink
-from palpate.io.sensor import OPENED, SensorCounters, TransferObserver
-
-if TYPE_CHECKING:
-    from palpate.io.skin_stream import FrameStream
+from palpate.io.sensor import OPENED, FrameStream, SensorCounters, TransferObserver
 
 RATE_TOLERANCE = 0.01
 """Largest relative difference of the board's rate from the bundle's, for crystals and timers."""
@@ -56,8 +53,7 @@ _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 class Stream:
     """Converts the bytes of a readout board to Frames with unwrapped numbers and host times. It
     does no I/O, and counts damaged data. unpack: finds the packets in bytes, as `packets.unpack`
-    does. loss_known: every lost frame is seen, as the skin counts its frames. misfit: why bytes are
-    not frames, and the remedy, as far as it shows."""
+    does."""
 
     loss_known = True
     misfit = ""

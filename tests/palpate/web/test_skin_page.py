@@ -47,7 +47,7 @@ def test_it_shows_loads_figures_and_faults(browser, page):
     assert [title.split(":")[0] for title in faulty] == ["taxel 2.1 axis 1", "taxel 1.2 axis 3"]
     asked = {request.removeprefix(page.address).split("?")[0] for request in seen.requests}
     scripts = {f"/{name}.js" for name in ("old", "skin_show", "events", "parts", "skin")}
-    assert asked <= {"/", "/page.css", "/events", "data:,"} | scripts
+    assert asked <= {"/", "/page.css", "/events", "/logo.svg"} | scripts
     assert not seen.errors
     seen.page.close()
 

@@ -222,7 +222,7 @@ class Fit:
         return cls(
             weights,
             meta["scale"],
-            Architecture(**shape | {"channels": tuple(shape["channels"])}),
+            Architecture(**shape | {key: tuple(shape[key]) for key in ("channels", "pools")}),
             ranges and graph.Ranges(ranges["counts"], tuple(ranges["responses"])),
             *read_sides(arrays, meta),
             meta["about"],
