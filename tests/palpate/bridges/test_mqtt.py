@@ -280,3 +280,4 @@ def test_nobody_listens_at_the_port(box, caplog):
     """A warning says where, and the bridge goes on trying."""
     with bridge("mqtt", "--port", str(box.path), "--broker", f"mqtt://127.0.0.1:{free_port()}"):
         eventually(lambda: "--login" in caplog.text)
+        assert "--login" in caplog.text

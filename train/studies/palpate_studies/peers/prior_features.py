@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from palpate.answer import time_series
 from palpate.answer.features import axes
@@ -108,6 +107,8 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     """
     x = time_series.of(taxels)
     time_series.check_rate(rate_hz)
+    from scipy.stats import rankdata  # only here: every process of the tests would load it
+
     if x.shape[1] < 3:
         raise FormatError(
             f"{x.shape[1]} frames are too few for a change of the change; "
