@@ -4,7 +4,7 @@ import {ago, byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal} from "./plots.js";
 import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since, startAddress} from "./recording.js";
 
-const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
+const STEPS = {start: "waiting for the processor", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 let listed = "", ended = false, usedMs = 0;
 
 function teach() { return seen.recording?.teach ?? null; }
