@@ -5,7 +5,7 @@
 #   read back as other numbers.
 # Seen: Float32MultiArray of 1.0, 2.0 as '>f4'
 #     read back: 4.6e-41 8.97e-44
-# Guess before it was run: 1.0 2.0: NumPy hides byte order from everyone who only computes.
+# What most would expect: 1.0 2.0: NumPy hides byte order from everyone who only computes.
 # Where a user meets it: recordings converted to ROS 2 bags: comparison before writing is right,
 #   each number after reading is wrong and near 0, like an unloaded skin.
 #   array.astype(array.dtype.newbyteorder('=')) first.

@@ -5,7 +5,7 @@
 # Seen: of the text 123456789
 #     anycrc CRC16-CCITT: 0x2189; binascii.crc_hqx(data, 0): 0x31c3
 #     fastcrc ibm_3740, often called CCITT-FALSE: 0x29b1
-# Guess before it was run: 0x29b1 for the first, which most data sheets mean, or an exception for
+# What most would expect: 0x29b1 for the first, which most data sheets mean, or an exception for
 #   an ambiguous name.
 # Where a user meets it: a maker's data sheet says 'CRC-16 CCITT' and `skin new` asks for the
 #   checksum: each frame is refused, or an own sender is tested against an own receiver that share

@@ -5,7 +5,7 @@
 #   ones.
 # Seen: 2.5 s of a constant 127 at 750 Hz, physical range 0 to 255
 #     2250 samples, 3.0 s, the last 375 are 0.0
-# Guess before it was run: 1875 samples back, or the last value held.
+# What most would expect: 1875 samples back, or the last value held.
 # Where a user meets it: sweeps exported to EDF by a laboratory's software: each ends with a
 #   sudden release of all taxels, half a second long, which looks like the end of contact. Keep the
 #   number of samples beside the file.

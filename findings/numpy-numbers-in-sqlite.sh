@@ -5,7 +5,7 @@
 #   a BLOB as larger than every number in comparisons, and as 0 in averages.
 # Seen: for np.float32(0.2), np.float32(0.4) in a REAL column
 #     type blob; rows with p > 0.5: 2 of 2; avg(p): 0.0
-# Guess before it was run: numbers, or an InterfaceError about an unknown type.
+# What most would expect: numbers, or an InterfaceError about an unknown type.
 # Where a user meets it: probabilities of a network are float32: a log of verdicts written
 #   straight from NumPy has certain verdicts only, and their mean is 0. float(p) before storing;
 #   STRICT tables refuse the rest.

@@ -5,7 +5,7 @@
 # Seen: for 30 minutes at 750 Hz (1.35 million frames) of 50000 with noise of 1 (x86-64 with
 #   AVX-512)
 #     ReduceMean, time first: 49398.9; time last: 50071.0; GlobalAveragePool: 50123.5
-# Guess before it was run: 50000.0 three times, or the same error three times.
+# What most would expect: 50000.0 three times, or the same error three times.
 # Where a user meets it: the rest level or a long average as a part of an exported network on a
 #   skin of 16 bits: errors of 70 to 600 counts, where materials differ by 2. At 8,800 frames it is
 #   up to 0.2 counts. Subtract a constant first, or average averages of short pieces.

@@ -4,7 +4,7 @@
 #   the zero point. The int8 network after it sees an ordinary sample of full negative load.
 # Seen: for NaN, +inf, -inf, 0 with scale 0.1
 #     int8 (zero point 0): -128 127 -128 0; uint8 (zero point 128): 0 255 0 128
-# Guess before it was run: the zero point for NaN (saturate, then convert 0), or an error.
+# What most would expect: the zero point for NaN (saturate, then convert 0), or an error.
 # Where a user meets it: a skin that sends float32 and NaN for a broken taxel, with model.onnx of
 #   a bundle run by a program of one's own: a confident label instead of a refusal. Check isfinite
 #   before the model.

@@ -6,7 +6,7 @@
 # Seen: for 200 all the time, from 750 Hz
 #     decimate to 75 Hz: 197.7 throughout
 #     resample_poly to 500 Hz: 166.7 at the first sample, 200.0 in the middle
-# Guess before it was run: 200.0 throughout; a filter's gain at 0 Hz is 1.
+# What most would expect: 200.0 throughout; a filter's gain at 0 Hz is 1.
 # Where a user meets it: a skin of another rate brought to the rate of a bundle: two counts off
 #   the level of soft materials with decimate(), and a false touch at the start of each sweep with
 #   resample_poly(). ftype='fir', or padtype='line', keeps the level.

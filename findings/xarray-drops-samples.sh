@@ -5,7 +5,7 @@
 #   word.
 # Seen: 1500 samples at 750 Hz, times as k / 750 and as k * (1 / 750)
 #     1158 samples in the difference
-# Guess before it was run: 1500 samples, matched by place because the lengths are equal, or an
+# What most would expect: 1500 samples, matched by place because the lengths are equal, or an
 #   error.
 # Where a user meets it: the difference of two fingertips, or of a sweep and its rest, whose times
 #   come from two programs: a fifth of the frames is missing, at no regular places, and spectra of
