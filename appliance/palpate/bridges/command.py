@@ -6,7 +6,8 @@ import argparse
 import asyncio
 import sys
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
@@ -42,6 +43,11 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
     if kind == "tcp":
         args.short = args.short or settings.bridge.short
+    if kind == "opcua":
+        bridge = settings.bridge
+        args.folder, args.memory = args.folder or Path(bridge.opcua), Path(bridge.memory)
+        args.name = args.name or bridge.name
+        args.anonymous = args.anonymous or bridge.anonymous
     if args.port or args.link or args.feed:
         return
     if settings.serial.port == LINKS[kind]:
@@ -55,6 +61,15 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
             "set serial.port = "
             f'"{LINKS[kind]}", or name the box\'s serial line with --port'
         )
+
+
+@contextmanager
+def _needed(what: str, extra: str) -> Iterator[None]:
+    """Raises ConfigError if an import fails: `what` is not installed, and `extra` has it."""
+    try:
+        yield
+    except ImportError as e:
+        raise ConfigError(f"{what} is not installed ({e}); pip install 'palpate[{extra}]'") from e
 
 
 class BridgeServer(Protocol):
@@ -101,19 +116,14 @@ def _tcp(args: argparse.Namespace) -> Served:
 
 
 def _opcua(args: argparse.Namespace) -> Served:
-    try:
+    with _needed("the OPC UA server", "opcua"):
         from palpate.bridges.mqtt_options import box_name
         from palpate.bridges.opcua import Offer, OpcuaBridge
-    except ImportError as e:
-        raise ConfigError(
-            f"the OPC UA server is not installed ({e}); pip install 'palpate[opcua]'"
-        ) from e
-    settings = config.load(None).bridge
+
     offer = Offer(
-        *(args.folder or Path(settings.opcua), Path(settings.memory)),
-        *(box_name(args.name or settings.name), args.most),
+        *(args.folder, args.memory, box_name(args.name), args.most),
         writes=args.allow_writes,
-        anonymous=args.anonymous or settings.anonymous,
+        anonymous=args.anonymous,
     )
     bridge = OpcuaBridge(partial(_source, args), SystemClock(), offer)
     return bridge, bridge.source.name, bridge.work, bridge.close
@@ -164,12 +174,9 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
 
 def run_mqtt(args: argparse.Namespace) -> int:
     """`palpate bridge mqtt`, until SIGTERM. Raises ConfigError without paho or a broker."""
-    try:
+    with _needed("the MQTT client", "mqtt"):
         from palpate.bridges import mqtt, mqtt_options
-    except ImportError as e:
-        raise ConfigError(
-            f"the MQTT client is not installed ({e}); pip install 'palpate[mqtt]'"
-        ) from e
+
     settings = config.load(None)
     settle("mqtt", args, settings)
     given = {name: getattr(args, name) or getattr(settings.bridge, name) for name in OF_BROKER}

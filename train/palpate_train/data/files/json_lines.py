@@ -23,9 +23,11 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     text, notes = decoded(data)
     whole, facts, step_s = _whole(text), dict[str, str](), None
     if isinstance(whole, dict):
-        step_s = _interval_s(whole.get("payload"))
         facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
-        whole, said = _unwrapped(whole, wanted)
+        if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
+            whole, step_s, said = _acquired(inner)
+        else:
+            whole, said = _unwrapped(whole, wanted)
         notes += said
     if isinstance(whole, list) and whole and isinstance(whole[0], list | dict):
         rows, what = list(enumerate(whole, 1)), "entry"
@@ -50,8 +52,6 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     An object holds a list for each column, as pandas writes them in three ways, or one list of
     frames beside facts about them. Raises FormatError.
     """
-    if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
-        return _acquired(inner)
     if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
         return [dict(zip(whole["columns"], row, strict=True)) for row in whole["data"]], []
     if all(isinstance(v, dict) and _is_numbered(v) for v in whole.values()):
@@ -70,8 +70,9 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     return [dict(zip(whole, row, strict=True)) for row in zip(*whole.values(), strict=True)], []
 
 
-def _acquired(payload: dict[str, Any]) -> tuple[Any, list[str]]:
-    """The frames of Edge Impulse's data acquisition format, by the names of its sensors."""
+def _acquired(payload: dict[str, Any]) -> tuple[Any, float, list[str]]:
+    """The frames of Edge Impulse's data acquisition format, by the names of its sensors, and the
+    time between two in s."""
     names = [str(sensor["name"]) for sensor in payload["sensors"]]
     rows = [row if isinstance(row, list) else [row] for row in payload["values"]]
     wrong = next((k for k, row in enumerate(rows, 1) if len(row) != len(names)), 0)
@@ -80,15 +81,9 @@ def _acquired(payload: dict[str, Any]) -> tuple[Any, list[str]]:
             f"entry {wrong} of its values has {len(rows[wrong - 1])} numbers, but there are "
             f"{len(names)} sensors"
         )
-    rate_hz = 1e3 / float(payload["interval_ms"])
-    return [dict(zip(names, row, strict=True)) for row in rows], [f"it was sent at {rate_hz:g} Hz"]
-
-
-def _interval_s(payload: Any) -> float | None:
-    """The time between two frames that Edge Impulse's format states."""
-    if not isinstance(payload, dict) or "values" not in payload:
-        return None
-    return float(payload["interval_ms"]) / 1e3
+    step_s = float(payload["interval_ms"]) / 1e3
+    frames = [dict(zip(names, row, strict=True)) for row in rows]
+    return frames, step_s, [f"it was sent at {1 / step_s:g} Hz"]
 
 
 def _is_numbered(column: dict[str, Any]) -> bool:
