@@ -260,9 +260,11 @@ def pooled(
         size = g("Mul", size, g.constant(bank.reach / (MIDDLE - 1 if how.int8 else 1)))
         return g("Log", g("Add", size, g.constant(FLOOR)))
 
-    made = (magnitudes, lambda: mean(_above(g, y, bank.limits, how.int8)))
-    kinds = [make for name, make in zip(POOLS, made, strict=True) if name in how.pools]
-    return [g("Transpose", make(), perm=[1, 0, 2]) for make in kinds]
+    def shares() -> str:
+        return mean(_above(g, y, bank.limits, how.int8))
+
+    kinds = dict(zip(POOLS, (magnitudes, shares), strict=True))
+    return [g("Transpose", make(), perm=[1, 0, 2]) for n, make in kinds.items() if n in how.pools]
 
 
 def _of_own_group(g: GraphBuilder, bank: Bank, counts: Array) -> str:
