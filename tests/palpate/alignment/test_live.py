@@ -74,8 +74,7 @@ def states(views: list[View]) -> list[str]:
 
 
 def test_views_follow_the_touches(model):
-    """Finger off, then four touches, each nearer than the last: the message follows, and the last
-    touch is in place."""
+    """Finger off, then four touches, each nearer: the message follows; the last is in place."""
     views = views_of(resting(), model)
     seen = views(17)
     assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
@@ -108,8 +107,7 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model):
 
 
 def test_a_skin_that_is_never_near_zero(model):
-    """The bundle's counts of the unloaded skin are subtracted: the finger is detected, and the hint
-    counts above them."""
+    """The bundle's counts of the unloaded skin are subtracted: finger and hint are right."""
     rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
     seen = views_of(pressed(130, 145, 52, 130), rest)(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
@@ -124,8 +122,7 @@ def known(model: Bundle, **changes: object) -> Expected:
 
 @pytest.mark.parametrize("lacks", ["a threshold", "positions", "a bundle"])
 def test_without_trained_positions_the_centre_alone_is_shown(model, lacks):
-    """The threshold comes from the present unloaded skin if the bundle has none. The centre is in
-    taxels, and the hint says what to do."""
+    """The threshold is that of the present skin; the centre is in taxels."""
     bare = {"contact": None, "displacement": None}
     limits = replace(model.manifest.thresholds, contact=None)
     expected, hint = {
@@ -142,8 +139,7 @@ def test_without_trained_positions_the_centre_alone_is_shown(model, lacks):
 
 
 def test_an_unplugged_skin_is_shown_and_waited_for(model):
-    """While the skin is unplugged, the View has its state and advice, and no old picture. After it
-    is plugged in, the unloaded skin is measured anew."""
+    """State and advice, no old picture; afterwards the tare is measured anew."""
     simulated = resting()
     views = views_of(simulated, model)
     views(2)
@@ -161,8 +157,7 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model):
     ("source", "word"), [("usb", ""), ("sim", "SIMULATED  "), ("replay", "REPLAYED  ")]
 )
 def test_a_line_says_what_it_is_of(source, word):
-    """A replayed set is not called simulated, a real skin has no note; a View without a contact has
-    no centre."""
+    """A replayed set is not called simulated; a View without a contact has no centre."""
     assert line(replace(VIEW, source=source, centre=None)) == f"{word}too far  (move it)"
     assert "row 3.8 column 6.0 mm" in line(replace(VIEW, source=source))
 
@@ -170,8 +165,7 @@ def test_a_line_says_what_it_is_of(source, word):
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
 def test_align_with_what_is_simulated(which, want, tmp_path, default_bundle, capsys, monkeypatch):
-    """`align --sim skin` and `--sim replay:SET` find a contact, and say that they are simulated or
-    replayed."""
+    """`align --sim skin` and `--sim replay:SET` find a contact and say what they show."""
     np.savez(
         tmp_path / "s.npz",
         samples=default_bundle.golden,
@@ -209,8 +203,7 @@ def test_another_skin_shape(model):
 
 
 def test_only_the_normal_axis_is_looked_at(model):
-    """A finger on the simulated skin with shear is found at its position. Shear, which may be
-    negative, is not shown."""
+    """A finger on the skin with shear is found at its position; shear is not shown."""
     world = skin.World(shear=True)
     other = replace(model, manifest=replace(model.manifest, format=world.format))
     script_of = script.named("rest", world.format, 1)[0]
@@ -229,8 +222,7 @@ VIEW = View(
 
 
 def test_a_view_is_shown_five_times_a_second_and_printed_once(model, monkeypatch):
-    """There is a View every VIEW_NS, not a View for each frame; lines come once a second. `stopped`
-    ends the command, and the skin is released."""
+    """A View every VIEW_NS, a line a second; `stopped` ends it all."""
     for line_ns, lines in ((0, range(24, 27)), (SECOND, range(5, 7))):
         simulated, out = resting(), io.StringIO()
         end_ns = simulated.clock.now_ns() + 5 * SECOND

@@ -22,8 +22,7 @@ def test_the_centre_of_a_contact_that_lies_on_the_skin(at):
 
 
 def test_only_the_normal_axis_of_several_counts():
-    """Shear, however large, does not move the centre; only the normal axis counts, tare
-    included."""
+    """Shear, however large, does not move the centre; the tare counts."""
     load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
     flat = counts(load + tare)
     shear = np.stack([500 * np.indices((4, 4))[0], -counts(load)[0]], axis=-1)
@@ -38,8 +37,7 @@ def test_only_the_normal_axis_of_several_counts():
 
 
 def test_without_contact_there_is_no_centre():
-    """Below the threshold, or if a floating-point skin gives no number: None, and no
-    displacement."""
+    """Below the threshold, or where a skin gives no number: None, no displacement."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
         assert displacement(counts(load).mean(axis=0), TARE, 5.0, MIDDLE).text == ""
@@ -48,8 +46,7 @@ def test_without_contact_there_is_no_centre():
 
 
 def test_pulled_and_silent_taxels_have_no_weight():
-    """A tared skin's threshold may be negative; a taxel with negative load has no weight. A silent
-    taxel at the rim of the contact, or at its corner, is not filled in."""
+    """With a tare loads may be negative; silent taxels at the rim are not filled in."""
     load = np.array([[-3.0, 0, 0, 0], [0, 50, 50, 0], [0, 50, 50, 0], [0, 0, 0, -3]])
     assert centre(counts(load), TARE, -10.0) == (1.5, 1.5)
     load = np.zeros((4, 4))
@@ -60,8 +57,7 @@ def test_pulled_and_silent_taxels_have_no_weight():
 
 @pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
 def test_a_dead_taxel_does_not_push_the_centre_away(dead):
-    """Silent between two loaded ones it is filled in: the centre stays within 0.15 taxels; without
-    that it would not."""
+    """Filled in between two loaded ones, the centre stays within 0.15 taxels."""
     load = patch(1.5, 1.5) + 30
     whole = np.array(centre(counts(load), TARE, 5.0))
     load[dead] = 0
@@ -76,8 +72,7 @@ def test_a_dead_taxel_does_not_push_the_centre_away(dead):
     [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
 )
 def test_the_advice_follows_the_simulated_skin(along, axis, towards):
-    """The further forward the skin is, the further back is the centre, if the end of the pad is
-    near; the advice names the right end."""
+    """The further forward the skin, the further back the centre; the end is right."""
     found, rng = [], np.random.default_rng(0)
     for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
         place = skin.Placement(**{along: mm}, seed=3)

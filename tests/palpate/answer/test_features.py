@@ -20,8 +20,7 @@ RATE, FRAMES = 750.0, 1500
 
 
 def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) -> np.ndarray:
-    """Raw counts uint8 [frames, rows, cols]: drift, a tone and noise, another mean on each
-    taxel."""
+    """Raw counts uint8 [frames, rows, cols]: drift, a tone and noise, a mean for each taxel."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None, None] / RATE
     level = rng.uniform(20, 120, (1, rows, cols))
@@ -67,8 +66,7 @@ def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel():
     ],
 )
 def test_l_features_are_equations_1_to_3(x, rate_hz, first, split):
-    """The same numbers from scipy's periodogram: bins 40 to 750 and 4 to 40 of 0.5 Hz; for 3x3
-    taxels at 100 Hz the upper band ends at 50 Hz."""
+    """The same numbers from scipy's periodogram, also where a band ends at Nyquist."""
     frames, last = len(x), len(x) // 2
     series = x.reshape(frames, -1).T.astype(float)
     hz, power = signal.periodogram(
@@ -83,8 +81,7 @@ def test_l_features_are_equations_1_to_3(x, rate_hz, first, split):
 
 
 def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
-    """Eq. 5 written out for 1500 frames at 750 Hz, in whole 1/1500 s, so that no window edge hangs
-    on rounding."""
+    """Eq. 5 for 1500 frames at 750 Hz, in whole 1/1500 s, so that no edge hangs on rounding."""
     n = np.arange(FRAMES)
     weights = x.reshape(FRAMES, -1).mean(axis=0) / x.reshape(FRAMES, -1).mean(axis=0).sum()
     p = np.zeros((40, 19))
@@ -101,8 +98,7 @@ def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
 
 
 def test_h_features_are_equation_5():
-    """All 760 numbers equal the paper's sum, with the mean subtracted and two neighbouring bins in
-    a band."""
+    """All 760 numbers equal the paper's sum: mean subtracted, two bins in a band."""
     x = _sweep()
     assert features.h_shape(FRAMES, RATE) == (40, 19)
     np.testing.assert_allclose(
@@ -112,8 +108,7 @@ def test_h_features_are_equation_5():
 
 @pytest.mark.parametrize(("window", "scipys"), [("rect", "boxcar"), ("hann", "hann")])
 def test_h_features_agree_with_a_spectrogram(window, scipys):
-    """At 1000 Hz steps are whole frames: all windows but the cut-off one equal scipy's; the bins
-    end at 370 Hz."""
+    """Where steps are whole frames all windows equal scipy's, but the cut-off one."""
     x = _sweep(2000)
     taxels = x.reshape(2000, -1).T.astype(float)
     _, _, spectrum = signal.spectrogram(
@@ -137,8 +132,7 @@ def test_a_silent_or_saturated_skin_has_finite_features(level):
 
 
 def test_few_frames_give_l_features():
-    """A band without a bin keeps the bin above its lower edge: ten frames at 750 Hz have bins 75 Hz
-    apart; at 30 Hz none lies above 15 Hz. Of one frame there are no H-features."""
+    """A band without a bin keeps the bin above its lower edge; one frame has no H-features."""
     x = _sweep(10)
     assert features.l_features(x, RATE)[2] == pytest.approx(75)
     assert features.l_features(x, 30.0)[1] == pytest.approx(15)
@@ -150,8 +144,7 @@ def test_few_frames_give_l_features():
 @settings(max_examples=60)
 @given(any_counts(30, 90), st.floats(20, 300))
 def test_results_are_finite_for_any_counts(taxels, rate_hz):
-    """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0
-    to 1."""
+    """Weights sum to 1, centroids are below Nyquist, H-features as `h_shape` says."""
     weights = features.taxel_weights(taxels)
     assert weights.sum() == pytest.approx(1)
     assert weights.min() >= 0
@@ -175,8 +168,7 @@ def test_results_are_finite_for_any_counts(taxels, rate_hz):
     ],
 )
 def test_the_number_of_h_features_follows_from_frames_and_rate(frames, rate_hz, shape):
-    """Whole steps of 0.05 s times bands of 20 Hz up to 375 Hz or Nyquist, as many as `h_features`
-    gives."""
+    """Whole steps of 0.05 s times bands of 20 Hz up to Nyquist."""
     assert features.h_shape(frames, rate_hz) == shape
     assert len(features.h_features(np.ones((frames, 1, 1), np.uint8), rate_hz)) == math.prod(shape)
 

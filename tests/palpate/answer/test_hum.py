@@ -35,8 +35,7 @@ def counts(x: NDArray[np.float64], format: SweepFormat = FORMAT) -> NDArray[np.u
 
 @pytest.mark.parametrize("hz", [50.0, 60.0, 49.85, 60.2])
 def test_hum_is_removed(hz):
-    """At the frequencies of mains and somewhat beside them. The sweep remains except for
-    rounding."""
+    """At the frequencies of mains and somewhat beside them; the sweep remains."""
     filter, clean = HumFilter(FORMAT), sweep()
     found, amplitude = filter(counts(clean + hum(hz=hz)), LIMIT)
     assert amplitude == pytest.approx(3, rel=0.05)
@@ -56,8 +55,7 @@ COMBS = {
 @pytest.mark.parametrize("share", [1.0, 0.4, 0.3])
 @pytest.mark.parametrize("comb", COMBS.values(), ids=COMBS.keys())
 def test_a_comb_is_removed(comb, share):
-    """All lines of the mains are removed from whole windows and from unfinished ones. The sweep
-    remains except for rounding and for the little that it has at these frequencies."""
+    """All lines of the mains, from whole and unfinished windows; the sweep nearly remains."""
     frames = int(share * FORMAT.window)
     clean = sweep()[:frames]
     lines = sum(hum(hz=hz, counts=4 * size) for hz, size in comb.items())

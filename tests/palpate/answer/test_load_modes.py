@@ -31,8 +31,7 @@ def test_sound_values_tell_the_broken_ones(places):
 
 @pytest.mark.parametrize(("shape", "mask"), [((3, 2), (1, 0)), ((3, 1, 2), (0, 0))])
 def test_a_broken_taxel_is_filled_on_all_axes(shape, mask):
-    """Neighbours, which are pressed harder or less, would be far off. Counts stay whole, the given
-    ones as they were."""
+    """Where neighbours would be far off; counts stay whole, given ones unchanged."""
     taxels = np.rint(frames()).astype(np.int16).reshape(-1, *shape)
     broken = np.zeros(shape[:2], bool)
     broken[mask] = True

@@ -1,5 +1,4 @@
-"""Objects end without NEW OBJECT: by a sweep that contradicts them, by a pause, and after
-max_sweeps."""
+"""Objects end without NEW OBJECT: by a contradiction, a pause, and after max_sweeps."""
 
 from __future__ import annotations
 
@@ -43,8 +42,7 @@ def classifier(bundle: Bundle, settings: ClassifierConfig = DELIVERED, **more: A
 
 
 def timed(sweeps: Iterable[Sweep], pause_s: float = 7) -> list[Sweep]:
-    """The sweeps with numbers and times, of an object that was signalled before the first. A slide
-    takes 3 s."""
+    """The sweeps with numbers and times, of an object that was signalled; a slide takes 3 s."""
     period, slide = round((pause_s + 3) * S), 3 * S
     return [
         replace(one, id=n, start_ns=n * period, stop_ns=n * period + slide, object=one.object or 1)
@@ -75,8 +73,7 @@ def toy(tmp_path: Path) -> Bundle:
 
 @pytest.mark.parametrize("labels", [2, 6, 50])
 def test_a_bayes_factor_of_ten_contradicts(labels):
-    """The likelihood ratio K * sum(fused * own) is compared with 1 / 10, however many labels there
-    are. Unsure sweeps contradict nothing."""
+    """K * sum(fused * own) against 1 / 10 for any K; unsure sweeps contradict nothing."""
 
     def ratio_of(r: float) -> tuple[np.ndarray, np.ndarray]:
         fused, own = np.zeros(labels), np.zeros(labels)
@@ -99,8 +96,7 @@ def test_a_pause_is_from_the_end_to_the_start():
 
 
 def test_a_contradiction_begins_another_object(toy):
-    """Its evidence is that sweep alone, the detail has both labels, and later sweeps are fused with
-    it. With `vote` the sweep is compared with the share of the votes."""
+    """Its evidence is that sweep alone, also with `vote`; the detail has both labels."""
     assert [short(one) for one in map(classifier(toy), felt(A, A, B, B, A))] == [
         ("ok", "a", 1, ""),
         ("ok", "a", 2, ""),
@@ -112,8 +108,7 @@ def test_a_contradiction_begins_another_object(toy):
 
 
 def test_an_unsure_sweep_is_fused(toy):
-    """A sweep that is not sure of another label does not end the object, and neither does a sure
-    sweep after unsure ones."""
+    """Neither an unsure sweep of another label nor a sure one after unsure ones ends the object."""
     it = classifier(toy, min_probability=0.9)
     assert labels(it, A, (3.2, -1.0)) == [("a", 1), ("a", 2)]
     it.forget()
@@ -121,8 +116,7 @@ def test_an_unsure_sweep_is_fused(toy):
 
 
 def test_a_contradiction_can_be_refused(toy):
-    """The answer is `conflict` without a label, and the evidence stays as it was, until NEW
-    OBJECT."""
+    """`conflict` without a label, and the evidence stays, until NEW OBJECT."""
     it, sweeps = classifier(toy, conflict="refuse"), felt(A, B, A, B)
     given = [it(sweep) for sweep in sweeps]
     refused = ("conflict", "", 0, f"{ANOTHER}b after a")
@@ -170,8 +164,7 @@ def test_sweeps_by_themselves_end_no_object(toy, object, fuse):
     ("conflict", "label", "fused"), [("new", "b", 1), ("refuse", None, 3), ("fuse", "a", 4)]
 )
 def test_early_answers_end_objects_too(toy, conflict, label, fused):
-    """A sure early answer of another label begins an object. If it is refused, or not ok, the sweep
-    goes on and does not count."""
+    """A sure one of another label; if it is refused or not ok, the sweep goes on uncounted."""
     it = classifier(toy, conflict=conflict)
     first, second, third, fourth = felt(A, A, B, A)
     assert [it(sweep).fused for sweep in (first, second)] == [1, 2]
@@ -191,8 +184,7 @@ def test_enrolled_labels_contradict(tmp_path):
 
 
 def drawn(materials: Iterable[int], seed: int) -> list[tuple[str, Sweep]]:
-    """A sweep of each material (an index into MATERIALS) with its name. The skin is attached anew
-    after every 30."""
+    """A sweep of each material (an index into MATERIALS) with its name; attached anew every 30."""
     rng = np.random.default_rng(seed)
     places = skin.placements("T-REAL", seed)
     found = []
@@ -225,8 +217,7 @@ ORDERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_new_object_forgotten(default_bundle, order):
-    """NEW OBJECT once, then 240 sweeps of six materials: at most 1 % of the answers are wrong
-    though the sweep alone is right. If all are fused, over half are."""
+    """240 sweeps of six materials after one NEW OBJECT: 1 % wrong at most; fused over half."""
     truth, sweeps = zip(*drawn(ORDERS[order](), 41), strict=True)
     alone = named(classifier(default_bundle), sweeps)
 
@@ -240,8 +231,7 @@ def test_new_object_forgotten(default_bundle, order):
 
 
 def test_the_settings_reach_the_classifier(toy):
-    """By `assembly.classifier`, which the box, its shadow and replays of captures use; the rule is
-    kept with each sweep."""
+    """Box, shadow and replays use `assembly.classifier`; the rule is with each sweep."""
     sets = ("conflict=refuse", "object_s=7.5", "max_sweeps=3", "fuse=vote", "min_probability=0.6")
     for given in ((), sets):
         settings = load([f"classifier.{text}" for text in given])
@@ -255,8 +245,7 @@ def test_the_settings_reach_the_classifier(toy):
 
 @pytest.mark.parametrize("fusion", ["product", "vote"])
 def test_an_object_without_end_takes_no_more_memory_or_time(toy, fusion):
-    """After 300 sweeps of one object the fused sweeps are as small as after two, and the fused
-    probabilities are those of all sweeps."""
+    """After 300 sweeps as small as after two, and all are fused."""
     it = classifier(toy, UNTIL_NEW_OBJECT, fuse=fusion)
     rng, given = np.random.default_rng(1), []
     sizes = []

@@ -1,5 +1,4 @@
-"""Speed and direction of a slide: patterns that pass the taxels at a known speed, and windows in
-which nothing can be measured."""
+"""Speed and direction of a slide, and windows in which nothing can be measured."""
 
 from __future__ import annotations
 
@@ -73,8 +72,7 @@ def test_the_pitch_scales_the_speed():
 
 @pytest.mark.parametrize("shear", [False, True])
 def test_the_simulators_texture_travels(shear):
-    """The simulated finger slides towards row 4, which leads, at 30 mm/s; a skin with shear, whose
-    normal axis is the last, gives the same."""
+    """Towards row 4, which leads, at 30 mm/s; the same with shear."""
     world = replace(skin.WORLD, shear=shear)
     window = skin.window("plastic rough", skin.Placement(), np.random.default_rng(1), world)
     expect_measured(SlideMeter(world.format, skin.PITCH_MM), window, within=0.05)
@@ -142,8 +140,7 @@ def test_windows_without_a_slide_say_why():
 
 
 def test_speeds_beyond_the_limits_are_not_guessed():
-    """A slide that passes too few taxels in a window, which 4x4 taxels do not notice at all, and
-    one that passes more than 100 a second."""
+    """Too few taxels pass in a window, or more than 100 a second."""
     slow, larger = {"wave_mm": (2.0, 8.0)}, replace(FORMAT, rows=6, cols=6)
     meter, wide = (SlideMeter(format, PITCH_MM) for format in (FORMAT, larger))
     found = [
@@ -184,8 +181,7 @@ def test_a_single_line_of_taxels_is_enough(rows, cols, direction):
 
 
 def test_a_large_skin_is_measured_where_it_is_touched():
-    """Of 16x32 taxels a corner touches; a loud taxel elsewhere attracts nothing, and the tables
-    stay below 2 MB for ten seconds at 1 kHz."""
+    """A loud taxel elsewhere attracts nothing, and tables stay below 2 MB."""
     format = SweepFormat(16, 32, 1000.0, 10_000, "float32")
     rng = np.random.default_rng(4)
     taxels = 0.5 * rng.standard_normal((10_000, 16, 32))

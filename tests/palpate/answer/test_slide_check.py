@@ -67,8 +67,7 @@ def test_enrolment_names_the_sweep_that_was_none(model, kind):
 
 
 def test_a_sweep_that_is_answered_can_be_taught(model):
-    """Slides under more and more noise: a pattern that is enough for an answer is enough for a
-    lesson."""
+    """Under more and more noise: enough for an answer is enough for a lesson."""
     run, meter = Classifier(model, VirtualClock()), SlideMeter(model.format, 1.0)
     check, rng = enrolment.slide_check(model), np.random.default_rng(8)
     weak = 0

@@ -78,8 +78,7 @@ CLIPPED = broken(SIX, count=GOOD.max() + 20)
     ],
 )
 def test_a_broken_taxel_is_bridged_and_named(run, taxels, degraded):
-    """The answer is ok, and the recorded sweep stays as it was. Taxel 1.1 carries the material of
-    the toy; its neighbour 1.2 does not, so that the bridged load is that of material a."""
+    """Answered as material a, which the neighbour shows; the sweep stays as it was."""
     before = taxels.copy()
     verdict = run(sweep_of(taxels))
     assert (verdict.status, verdict.label) == (Status.OK, "a")
@@ -89,8 +88,7 @@ def test_a_broken_taxel_is_bridged_and_named(run, taxels, degraded):
 
 
 def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(run, tmp_path):
-    """Six constant taxels are more than may be bridged. They are at the ceiling, so they are not
-    broken; a bundle that tolerates as many full counts answers and says the share."""
+    """At the ceiling they are not broken; the share is said."""
     few = made(tmp_path)
     limits = replace(few.manifest.thresholds, saturated=0.5)
     many = replace(few, manifest=replace(few.manifest, thresholds=limits))
@@ -190,8 +188,7 @@ def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch, kind):
     ],
 )
 def test_which_streams_make_a_taxel_broken(watch, stretches, named):
-    """Single bad stretches are forgiven; the grouping of frames does not matter. Another skin
-    begins without broken taxels."""
+    """Single bad stretches are forgiven, grouping does not matter, a skin begins sound."""
     assert seen(watch, *stretches, times=4 * CERTAIN) == named
     assert seen(watch, GOOD, epoch=1) == ""
 
@@ -203,8 +200,7 @@ def test_a_resting_skin_does_not_clear_a_silent_taxel(watch):
 
 
 def test_too_many_taxels_over_the_stream_are_refused(run):
-    """Also in a window in which they happen to be sound. A sidecar has an entry only of a skin with
-    broken taxels."""
+    """Also in a window in which they are sound; sidecars of sound skins are free."""
     assert "broken" not in run.about()
     for _ in range(CERTAIN):
         run.frames(frames_of(broken(FOUR)))

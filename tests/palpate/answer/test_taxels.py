@@ -27,8 +27,7 @@ RULE = Bridging(taxels=3, row=True, column=True, noise=4.0, quietest=1.0, still=
 
 
 def slide(axes: int = 1, seed: int = 0) -> np.ndarray:
-    """Raw counts uint8 [T, 6, 5] or [T, 6, 5, A]: a contact whose load and noise fall off by half
-    from its middle to its edge."""
+    """Raw counts uint8 [T, 6, 5] or [T, 6, 5, A]: load and noise fall off to the contact's edge."""
     rng = np.random.default_rng(seed)
     r, c = np.indices((ROWS, COLS))
     load = 1 - 0.5 * np.hypot(r - 2.5, c - 2) / 4
@@ -63,8 +62,7 @@ def found(taxels: np.ndarray, rule: Bridging = RULE, limits: WindowLimits = LIMI
     ],
 )
 def test_a_constant_taxel_is_silent(place, count, named):
-    """Dead, stuck, or without a number in one frame. A broken wire of a matrix silences a row or a
-    column, also at the edge. A sound skin has no broken taxel."""
+    """Dead, stuck, without a number, or a silent row or column; a sound skin has none."""
     taxels = slide() if np.isfinite(count) else slide().astype(np.float32)
     assert found(taxels) == ""
     taxels[place] = count
@@ -118,8 +116,7 @@ def test_a_still_skin_has_no_silent_taxel():
 
 
 def test_a_skin_whose_sound_taxels_may_be_constant():
-    """Then a constant taxel is silent if it is loaded, or if all direct neighbours are; one at the
-    edge of the contact may be sound."""
+    """Silent is one that is loaded, or whose direct neighbours all are."""
     rule, taxels = replace(RULE, still=True), slide()
     taxels[:, 0] = 0  # beside the contact
     assert found(taxels, rule) == ""
@@ -147,8 +144,7 @@ def test_a_taxel_is_compared_with_the_lower_median_around_it():
 
 
 def test_noise_is_measured_at_triples_of_frames():
-    """White noise of deviation 1 has a mean second difference of sqrt(6 * 2 / pi); a ramp has
-    none; two frames show none."""
+    """White noise gives sqrt(6 * 2 / pi); a ramp none; two frames none."""
     rng = np.random.default_rng(0)
     white = rng.standard_normal((30 * TRIPLES, 1, 1)).astype(np.float32)
     assert Window(white).noise[0] == pytest.approx(np.sqrt(12 / np.pi), rel=0.2)
@@ -222,8 +218,7 @@ def test_the_number_that_may_be_bridged(place, allowed):
 
 
 def test_broken_taxels_in_words_and_in_a_file():
-    """Both kinds; a taxel that is silent is not called noisy, too. Lists of another shape are
-    refused."""
+    """Both kinds, a silent one not noisy, too; lists of another shape are refused."""
     kinds = np.zeros((2, ROWS, COLS), bool)
     kinds[0, 1, 2] = kinds[1, 3] = True
     broken = BrokenTaxels.of(kinds)

@@ -1,5 +1,4 @@
-"""Distances of known and unknown materials, on a bundle that can be computed by hand: whole,
-displaced, disturbed and unfinished sweeps."""
+"""Distances of known and unknown materials, on a bundle that can be computed by hand."""
 
 from __future__ import annotations
 
@@ -67,8 +66,7 @@ def displaced_box(tmp_path: Path) -> Classifier:
 
 
 def test_a_material_has_its_own_shape(displaced_box):
-    """In the second direction "a" scatters twice as far as "b": it is known at a distance of 5.5,
-    and "b" is not."""
+    """ "a" scatters twice as far: it is known at a distance of 5.5, "b" is not."""
     places = [(0, -5.5), (0, -6.5), (6, -2.5), (6, -3.5)]
     assert [displaced_box(toy_bundle.sweep(*z)).label for z in places] == ["a", "", "b", ""]
     assert displaced_box(toy_bundle.sweep(6, -3.5)).status is Status.UNKNOWN
@@ -92,8 +90,7 @@ def test_a_displacement_makes_no_material_unknown(displaced_box, tmp_path):
 
 
 def test_a_displaced_sweep_needs_its_own_probability(displaced_box):
-    """Its logits are divided by the rule's temperature, and below the rule's probability it is
-    unsure. A second sweep of the object decides, or `max_sweeps` ends the object."""
+    """By the rule's temperature and limit; a second sweep or `max_sweeps` decides."""
     z = (2.2, 0.0)  # logits of "a" and "b" are (0, 6 * 2.2 - 18) / 2 = (0, -2.4), in place
     p, q = (1 / (1 + np.exp(-2.4 / t) + np.exp(-9 / t)) for t in (1, 3))
     assert displaced_box(toy_bundle.sweep(*z)).probability == pytest.approx(p, abs=1e-3)
@@ -106,8 +103,7 @@ def test_a_displaced_sweep_needs_its_own_probability(displaced_box):
 
 
 def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path):
-    """After an enrolment the probability of an enrolled label is computed from means, and for
-    displaced contacts from the means of displaced sweeps."""
+    """Their means are moved to displaced sweeps."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays(), sweeps=np.array([0, 0, 2]))
     made = toy_bundle.load(tmp_path / "toy", arrays=arrays, labels=2, **DISPLACED)
     far = ((np.array([-0.35, 0]) - arrays["displaced_means"]) ** 2).sum(1) / 2
@@ -240,8 +236,7 @@ def test_no_early_answer_for_an_unknown_material(tmp_path):
 
 
 def test_distances_have_the_shape_of_each_step():
-    """In the second step the second direction counts half. An embedding that is not a number lies
-    within no limit."""
+    """The second direction may count half; what is no number lies within no limit."""
     shapes = np.stack([np.eye(2), np.diag([1, 0.5])]).astype(np.float16)
     classes = EarlyClasses(np.tile(toy_bundle.MEANS, (2, 1, 1)), shapes)
     distances = EarlyDistances(classes, (4.0, 4.0))
@@ -277,8 +272,7 @@ def test_a_bundle_with_incomplete_checks_is_refused(tmp_path, more, why):
     ("farthest_mm", "status"), [(None, Status.OK), (0.5, Status.OK), (0.3, Status.UNKNOWN)]
 )
 def test_a_contact_is_named_up_to_the_farthest_displacement(tmp_path, farthest_mm, status):
-    """It lies 0.3 mm from its position in training. Beyond the limit the answer is `unknown` with
-    the direction, and no early answer is given."""
+    """Beyond it `unknown` with the direction, and nothing early."""
     rule = replace(toy_bundle.DISPLACEMENT, farthest_mm=farthest_mm)
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays(), **toy_bundle.early_arrays())
     made = early_toy(tmp_path, arrays=arrays, **DISPLACED | {"displacement": rule})

@@ -1,5 +1,4 @@
-"""The unloaded skin is found in the stream: when the finger is lifted, certain only after a touch,
-and never guessed."""
+"""The unloaded skin in the stream: certain only after a touch, and never guessed."""
 
 from __future__ import annotations
 
@@ -65,16 +64,14 @@ def test_a_tare_is_certain_and_stays():
 
 
 def test_whole_counts_have_a_least_difference():
-    """A skin whose noise lies below one count: two counts are a load; fractions have no such
-    limit."""
+    """With noise below a count, two are a load; fractions have no such limit."""
     still = np.full((50, 4, 4), 7, np.uint8)
     assert UnloadedSkin.measured(still).contact == 2
     assert UnloadedSkin.measured(still.astype(np.float32)).contact == 0
 
 
 def test_broken_taxels_do_not_count():
-    """A taxel that gives no number, and a taxel that is far noisier than the others, do not change
-    the threshold."""
+    """Without a number or far noisier than others, they do not change the threshold."""
     frames = skin(500, 3).astype(np.float32)
     whole = UnloadedSkin.measured(frames).contact
     frames[:, 0, 0] = np.nan

@@ -19,8 +19,7 @@ def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
 
 
 def test_it_is_the_deviation_over_the_load():
-    """Counts swing by 1 and by 4 around a load of 50; the gain does not matter. A swing of a
-    quarter of a count on a million counts is measured, too."""
+    """Whatever the gain; a quarter of a count on a million is measured, too."""
     want = [math.log(1 / 50), math.log(4 / 50)]
     assert vibration(window(1, 4), TARE, 2) == pytest.approx(want, abs=1e-3)
     strong = TARE + 10 * (window(1, 4) - TARE)

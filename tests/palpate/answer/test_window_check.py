@@ -1,5 +1,4 @@
-"""Checks of a window without a model: each kind of fault is found and named, and any window gets a
-status."""
+"""Checks of a window without a model: each fault is named, and any window gets a status."""
 
 from __future__ import annotations
 
@@ -38,8 +37,7 @@ def moving(level: float = 80, shape: tuple[int, ...] = (300, 4, 4)) -> np.ndarra
     ],
 )
 def test_a_spoiled_window_is_named(place, value, status, detail):
-    """Each kind of fault, with its taxel (row.column from 1). A loaded, vibrating skin is accepted.
-    As many dead taxels as the bundle allows are, too."""
+    """Each kind of fault with its taxel, from 1; a loaded skin and allowed dead taxels pass."""
     taxels = moving()
     assert inspect(taxels, BARE, LIMITS).status is Status.OK
     taxels[place] = value
@@ -95,8 +93,7 @@ def test_without_a_threshold_every_taxel_counts_as_loaded():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_taxel_that_gives_no_number_is_dead(value):
-    """One frame of it is enough, also at the edge, and for any number of dead taxels that the
-    bundle tolerates."""
+    """One frame is enough, also at the edge, for any number of allowed dead taxels."""
     taxels = moving().astype(np.float32)
     taxels[150, 0, 3] = value
     found = inspect(taxels, BARE, replace(LIMITS, dead_taxels=3))
@@ -129,8 +126,7 @@ def sheared() -> np.ndarray:
     ],
 )
 def test_a_spoiled_axis_is_named(place, value, status, detail):
-    """Each kind of fault on one axis or all of them; a taxel whose every axis is meant is named
-    alone."""
+    """Each kind of fault on one axis or all; a taxel whose every axis is meant stands alone."""
     taxels = sheared()
     assert inspect(taxels, SHEARED, THREE).status is Status.OK
     taxels[place] = value
@@ -182,8 +178,7 @@ UNLOADED = UnloadedSkin.measured(
     ],
 )
 def test_faults_are_found_without_a_bundle(place, value, status, detail):
-    """Contact, stuck and dead taxels by comparison with the unloaded skin, saturation by the
-    highest count."""
+    """By comparison with the unloaded skin; saturation by the highest count."""
     taxels = moving()
     assert inspect_bare(taxels, UNLOADED).status is Status.OK
     taxels[place] = value
@@ -209,8 +204,7 @@ def test_a_touch_is_a_difference_from_the_unloaded_skin():
     ("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)]
 )
 def test_the_full_scale_of_usual_converters(bits, status):
-    """Counts of ten bits in sixteen are saturated at 1023; a limit that no usual converter has is
-    not guessed."""
+    """Ten bits in sixteen are saturated at 1023; an unusual limit is not guessed."""
     taxels = moving().astype(np.uint16)
     taxels[::10, 1:3, 1:3] = 2**bits - 1
     assert inspect_bare(taxels, UNLOADED).status is status
@@ -218,8 +212,7 @@ def test_the_full_scale_of_usual_converters(bits, status):
 
 @pytest.mark.parametrize("value", [1e20, -3e15, np.inf, np.nan])
 def test_one_impossible_reading_kills_its_taxel(value):
-    """A single count beyond any skin, with a bundle, without one, and before the unloaded skin is
-    known: the taxel is named, so the sweep is not called good."""
+    """With a bundle, without, and before the unloaded skin is known."""
     taxels = moving().astype(np.float32)
     taxels[17, 1, 2] = value
     bare = UnloadedSkin(np.zeros((4, 4)), np.ones((4, 4)), 10.0)

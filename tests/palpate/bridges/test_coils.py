@@ -1,5 +1,4 @@
-"""Coils of the Modbus bridge: a coil is on only after the box has carried its command out, so a
-refused command that is sent again is carried out."""
+"""Coils of the Modbus bridge: on only once the box has carried the command out."""
 
 from __future__ import annotations
 
@@ -19,8 +18,7 @@ START, STOP, NEW = (1 << COILS.index(name) for name in ("START", "STOP", "NEW"))
 
 
 class ScriptedSource:
-    """Carries out commands, except those in `refused`; `sent` lists the commands it was given,
-    `slides` their values."""
+    """Carries out commands except `refused`; `sent` lists those given, `slides` their values."""
 
     name = "scripted"
 
@@ -159,8 +157,7 @@ LEVELS: dict[str, tuple[list[tuple[int, bytes]], list[str]]] = {
 
 @pytest.mark.parametrize(("writes", "sent"), LEVELS.values(), ids=LEVELS)
 def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(source, writes, sent):
-    """A controller that writes cyclically sends no command again after a broken connection, and
-    START with STOP is no sweep; a coil that rises is carried out."""
+    """Cyclic writers repeat nothing after a broken connection."""
     ask = fresh(ModbusBridge(source, SystemClock(), writes=True), [None] * len(COILS))
     assert [ask(several(bits))[:2] for bits, _ in writes] == [reply for _, reply in writes]
     assert source.sent == sent
@@ -193,8 +190,7 @@ def test_other_registers_are_not_written(source, ask, pdu, code):
 
 
 def test_start_has_the_registers_of_its_connection(source, ask):
-    """Tenths of mm/s and hundredths of N, written in one request or in two, and read back; 0 is
-    left out. Other commands and other connections have none."""
+    """Tenths of mm/s, hundredths of N; 0 is left out; other connections have none."""
     assert SLIDE_AT == 40
     assert ask(bytes.fromhex("10002800020401310096")) == bytes.fromhex("1000280002")
     assert ask(bytes.fromhex("0300280002")) == bytes.fromhex("030401310096")

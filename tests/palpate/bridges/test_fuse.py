@@ -80,8 +80,7 @@ def scored(p: dict[str, float], sweep: int = 1, **other: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("fingers", [("left", "right"), ("a", "b", "c", "d")])
 def test_each_finger_answers_then_the_hand(fingers):
-    """FIN in the order of the names whatever comes first, then RES with the product, all with the
-    hand's own number; nothing before the last finger has answered."""
+    """FIN in the order of the names, then RES with the product and the hand's number."""
     fused = Fused(*fingers)
     p = {"wood": 0.6, "metal": 0.3}
     for number in (1, 2):
@@ -156,8 +155,7 @@ def test_other_labels_are_not_fused(two):
 
 
 def test_a_finger_that_sweeps_is_waited_for(two):
-    """The skin of the left finger is away, so it is `not-ready` at the start edge; the right one
-    answers seconds later."""
+    """The left skin is away: `not-ready` at the start; the right answers seconds later."""
     two.take("right", feed_lines.state(sweeping=True))
     two.take("left", feed_lines.verdict(1, 1.0, status="not-ready"))
     two.wait(20 * GRACE_NS)
@@ -241,8 +239,7 @@ def units(tmp_path: Path) -> Iterator[dict[str, Offered]]:
 
 
 def test_the_program_reads_the_feeds(units):
-    """From the real feeds of two boxes to sentences on standard output, until SIGTERM. A busy
-    machine may fuse a finger alone before the other is heard."""
+    """From the feeds of two boxes to sentences, until SIGTERM; a busy machine may fuse one."""
     both = re.compile(rb"(\$PPLP,FIN.*\r\n){2}\$PPLP,RES")
     fingers = [f"{name}={one.path}" for name, one in units.items()]
     words = [sys.executable, "-m", "palpate.bridges", "fuse", "--fingers", *fingers]

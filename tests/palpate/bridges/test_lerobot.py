@@ -66,8 +66,7 @@ def taken(camera: Any, *lines: dict[str, Any]) -> dict[str, float]:
 
 
 def test_frames_verdict_and_displacement(camera):
-    """Raw counts by taxel, the code as on the class bits, and the distance from the nearest trained
-    position; a running sweep clears the previous answer."""
+    """Counts, code, distance from the nearest position; a sweep clears the last answer."""
     assert camera.feed.asked[0] == {"frames": 10, "sweeps": False}
     first = camera.observation()
     assert (first["verdict_code"], first["moved_known"]) == (0, 0)

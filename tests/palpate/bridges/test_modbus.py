@@ -1,5 +1,4 @@
-"""The Modbus bridge, seen by pymodbus's client and by bytes put together by hand; and
-its map alone."""
+"""The Modbus bridge, seen by pymodbus's client and by bytes put together by hand."""
 
 from __future__ import annotations
 
@@ -114,8 +113,7 @@ MEASURED = (
 
 
 def test_the_measured_slide_is_read(box, raw):
-    """Two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
-    speed, or a direction of a later version. They are refused to writers."""
+    """Tenths of mm/s and a code; 0 where RES has none or a later one; not writable."""
     for number, (optional, words) in enumerate(MEASURED, 1):
         box.say(result(number, optional=optional))
         eventually(lambda number=number: word(raw, "answers") == number)
@@ -127,8 +125,7 @@ FINGERS_AT = 44
 
 
 def test_the_fingers_are_read(box, raw):
-    """Their number, then name, status, label code and probability of each; 0 where there is none,
-    and after the next answer of a box with one skin."""
+    """Name, status, code and probability of each; 0 without, also after one skin's answer."""
     box.say(finger("left", 1, "ok", "paper"))
     box.say(finger("right", 1, "no-contact", "", "0.000"))
     box.say(result(1, label="paper"))
@@ -147,8 +144,7 @@ def test_the_fingers_are_read(box, raw):
 
 
 def test_another_client_sweeps(box, raw, address):
-    """pymodbus writes speed and force, and pulses NEW, START and STOP: the box hears them once
-    each, in order, and the answer's number rises."""
+    """pymodbus writes speed and force, pulses the coils: the box hears each once, in order."""
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
         assert not client.write_registers(modbus.SLIDE_AT, [305, 150]).isError()
         assert not client.write_coils(0, [False] * len(COILS)).isError()
@@ -213,8 +209,7 @@ def test_nothing_is_written_without_leave(box):
 
 
 def test_one_command_at_a_time(box, raw, address):
-    """While the box carries out a command, another peer gets the exception BUSY, and reading goes
-    on; afterwards the same write sends the command."""
+    """Meanwhile another peer gets BUSY, and reading goes on; then its write is sent."""
     box.script = lambda s: [] if s.kind == "TARE" else obeying(s)
     raw.send(bytes.fromhex("050003ff00"))
     box.wait_for("TARE")
@@ -274,8 +269,7 @@ def flood(peer: socket.socket) -> None:
 
 
 def test_hostile_bytes_reach_nobody_else(raw, address):
-    """Noise, wrong headers, an endless stream without sense, a peer that stops in the middle and
-    one that never reads: each loses its own connection at most."""
+    """Noise, wrong headers, endless, half or unread bytes cost their own connection."""
     generator = random.Random(1)
     for data in [
         *(generator.randbytes(generator.randrange(1, 400)) for _ in range(100)),
@@ -304,8 +298,7 @@ def test_hostile_bytes_reach_nobody_else(raw, address):
 
 
 def test_the_feed_in_place_of_the_line(tmp_path):
-    """On the box, beside a robot that has the serial line: the same map. Commands are refused;
-    lines of a later version are counted and do no harm."""
+    """The same map; commands are refused; lines of a later version do no harm."""
     told = {"margin": 0.3, "share": 0.5, "measured_mm_s": 61.2, "direction": "cols-"}
     lines = [
         feed_lines.hello(labels=["wood", "paper"]),

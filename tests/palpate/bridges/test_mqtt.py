@@ -1,5 +1,4 @@
-"""The MQTT bridge at Debian's mosquitto, seen by mosquitto_sub; and brokers that refuse, close, or
-send other bytes than MQTT."""
+"""The MQTT bridge at mosquitto, seen by mosquitto_sub; and brokers that refuse or close."""
 
 from __future__ import annotations
 
@@ -68,8 +67,7 @@ def test_another_client_reads_the_verdict(server, box):
 
 @pytest.mark.slow
 def test_nothing_is_lost_while_the_broker_is_away(server, box, monkeypatch):
-    """The newest verdicts come in order after the broker is back, marked late; older ones are
-    counted. The verdict after them is not late."""
+    """The newest come in order, marked late; older ones are counted."""
     monkeypatch.setattr(mqtt, "KEPT", 50)
     monkeypatch.setattr(mqtt, "LATE_NS", 200_000_000)
     with bridge("mqtt", *options(server, box)):
@@ -93,8 +91,7 @@ def test_nothing_is_lost_while_the_broker_is_away(server, box, monkeypatch):
 
 @pytest.mark.slow
 def test_the_backlog_is_complete(server, box):
-    """A subscriber whose session outlives the pause of the broker gets all 200 verdicts, each at
-    least once, in order."""
+    """A session that outlives the broker's pause gets all 200 verdicts in order."""
     with Subscriber(server.port, kept=True) as one, bridge("mqtt", *options(server, box)):
         online(box, one)
         server.stop()
@@ -121,8 +118,7 @@ def test_the_status_when_it_ends(server, box, ending):
 
 @pytest.mark.slow
 def test_commands_only_where_they_are_allowed(server, box):
-    """Without --allow-writes nothing is subscribed to; with it each command reaches the box, and a
-    retained or an unknown one does not."""
+    """Without --allow-writes none; with it neither retained nor unknown ones."""
     with Subscriber(server.port) as one:
         with bridge("mqtt", *options(server, box)):
             online(box, one)
@@ -163,8 +159,7 @@ def test_a_flood_of_commands(server, box, monkeypatch):
 
 @pytest.mark.slow
 def test_login_and_a_wrong_one(tmp_path, box, caplog):
-    """A broker with passwords: the right one is taken; a wrong one is refused, with a reason, and
-    tried again."""
+    """The right password is taken; a wrong one is refused, with a reason, and tried again."""
     required()
     users = tmp_path / "users"
     subprocess.run(
@@ -184,8 +179,7 @@ def test_login_and_a_wrong_one(tmp_path, box, caplog):
 
 @pytest.mark.slow
 def test_tls(tmp_path, box, caplog):
-    """With the broker's certificate in --ca the bridge connects; without it, the certificate is
-    refused."""
+    """With the broker's certificate in --ca the bridge connects; without it, it is refused."""
     required()
     certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
     words = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
@@ -203,8 +197,7 @@ def test_tls(tmp_path, box, caplog):
 
 @pytest.mark.parametrize("speech", [b"", b"HTTP/1.1 400\r\n\r\n", b"\x20\x03\x00\x00\x00\xff" * 9])
 def test_no_broker_at_the_address(box, caplog, speech):
-    """Something else answers, or closes: a reason is logged, the bridge goes on, and ends when
-    asked."""
+    """Whatever answers there: a reason is logged, and the bridge goes on until asked."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         ending = threading.Event()
         other.settimeout(0.1)

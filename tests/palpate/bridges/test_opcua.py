@@ -1,5 +1,4 @@
-"""The OPC UA bridge, seen by the library's client: results, quality, users, methods, hostile
-bytes."""
+"""The OPC UA bridge, seen by the library's client."""
 
 from __future__ import annotations
 
@@ -106,8 +105,7 @@ class Changes:
 
 @pytest.mark.slow
 def test_a_result_its_event_and_the_end_of_the_box(box, folder):
-    """States follow the box; a result comes whole, by subscription and as an event; without the box
-    nothing keeps a good quality, and the result is back with the box."""
+    """A result comes whole, and as an event; without the box nothing is good."""
     with served(box, folder, "--anonymous") as url, reader(url) as client:
         eventually(
             lambda: box.say(state()) or value(client, "VisionStateMachine.Skin") == "streaming"
@@ -142,8 +140,7 @@ def test_a_result_its_event_and_the_end_of_the_box(box, folder):
 
 @pytest.mark.slow
 def test_results_of_a_client_that_was_away(box, folder):
-    """A client that was away asks by time, and gets the results in order, at most as many as it
-    wants."""
+    """It asks by time, and gets them in order, at most as many as it wants."""
     with served(box, folder) as url, user(url, folder.parent) as client:
         eventually(
             lambda: box.say(state()) or value(client, "VisionStateMachine.Skin") == "streaming"
@@ -227,8 +224,7 @@ def test_users(box, folder, caplog):
 
 @pytest.mark.slow
 def test_hostile_bytes(box, folder):
-    """Other protocols, a message that never ends, connections that say nothing: each is closed, and
-    a client reads on."""
+    """Other protocols, endless messages, silent connections are closed; a client reads on."""
     with served(box, folder, "--anonymous") as url, reader(url) as client:
         port = int(url.rpartition(":")[2].strip("/"))
         endless = b"HELF" + (0xFFFFFFF0).to_bytes(4, "little")

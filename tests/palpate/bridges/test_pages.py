@@ -1,5 +1,4 @@
-"""The programs of docs/robots, run straight out of the pages: Python, and URScript read as Python.
-Modbus: test_modbus."""
+"""The programs of docs/robots, run out of the pages: Python, and URScript read as Python."""
 
 from __future__ import annotations
 
@@ -47,8 +46,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
 
 
 def test_python(box):
-    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are set aside,
-    each fault is an error."""
+    """`unsure` is swept again without NEW, final ones are set aside, each fault is an error."""
     names: dict[str, Any] = {}
     exec(page_blocks("python.md", "python")[0], names)
     with Palpate(str(box.path), timeout_s=LONG_S) as client:
@@ -111,8 +109,7 @@ class SocketOfUr:
 
 
 def urscript(block: str, **functions: Any) -> dict[str, Any]:
-    """A block of URScript as Python: `end` and `local` left out. functions: those of the
-    controller."""
+    """A block of URScript as Python, without `end` and `local`; functions: the controller's."""
     text = re.sub(r"(?m)^ *end\n", "", block).replace("local ", "")
     names: dict[str, Any] = {
         "str_find": lambda text, what, start=0: text.find(what, start),
@@ -224,8 +221,7 @@ def test_ros(box, block, program, settings):
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
 def test_the_manuals_client_without_hardware(tmp_path):
-    """Its three commands, with another path and a free port: the program names the bundle and
-    prints three answers, all `ok`, since the simulated finger follows START and STOP."""
+    """Its three commands: the program prints three answers, all `ok`."""
     text = (ROOT / "docs" / "how-to" / "write-a-client.md").read_text()
     blocks = [
         re.sub(r"(?m)^    ", "", block)

@@ -58,8 +58,7 @@ def verdict(box: SpeakingBox, node: RosPeer, line: bytes) -> dict:
 
 
 def test_an_answer_becomes_a_message(box, node):
-    """OK with the label; WARN if it cannot be used; ERROR if nothing was learned; with time stamp
-    and frame; early answers are marked."""
+    """OK with the label; WARN if unusable; ERROR if nothing was learned; early is marked."""
     eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
     heard = verdict(box, node, result(1, label="paper"))
     assert (heard["level"], heard["message"], heard["frame_id"]) == (OK, "paper", "fingertip")
@@ -104,8 +103,7 @@ def test_an_answer_names_its_fingers(box, node):
 
 
 def test_the_box_is_unplugged_dead_and_back(box, node):
-    """Diagnostics: OK, WARN once where something was lost, ERROR without a skin, STALE without a
-    box, and OK again; the state follows."""
+    """OK, WARN once after a loss, ERROR without a skin, STALE without a box, OK."""
 
     def level() -> int:
         return node.last("diagnostics")["level"]
@@ -152,8 +150,7 @@ def test_services(box, node):
 
 
 def test_the_lifecycle(box, node):
-    """Inactive, it publishes no verdict but diagnostics; cleaned up, it has let go of the line;
-    configured and activated again, it works."""
+    """Inactive no verdict; cleaned up no line; configured and activated again, it works."""
     assert node.call("deactivate")["success"]
     before = len(node.on("verdict"))
     box.say(result(1), state(answered=1))
@@ -181,8 +178,7 @@ def test_the_bridge_dies_and_comes_back(box):
 
 
 def test_a_late_node_gets_the_state(box, node):
-    """The last state is kept for later subscribers; the first node stands for the cell, the second
-    for a screen."""
+    """The last state is kept for later subscribers, such as a screen."""
     with ros.peer() as late:
         assert late.last("state")["values"]["skin"] == "streaming"
 
@@ -201,8 +197,7 @@ def fed(folder: Path) -> Iterator[tuple[socket.socket, RosPeer]]:
 
 
 def test_frames_from_the_feed(tmp_path):
-    """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave
-    no number."""
+    """As images, a channel an axis, little-endian; nan where a skin gave no number."""
     form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
     hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1", "format": form}
     frame = {"type": "frame", "time_ns": 1, "taxels": [[[1, 2, 3]], [[4, None, 6]]]}
@@ -242,8 +237,7 @@ ros.run([])
 
 
 def test_an_end_that_wakes_nobody_is_seen():
-    """rclpy's handler of signals may wake the executor before the context has ended, and the node
-    would wait without end."""
+    """rclpy may wake the executor before the context has ended: the node ends anyway."""
     done = subprocess.run(
         [ros.PYTHON, "-c", SILENT_END], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False
     )
@@ -284,8 +278,7 @@ def test_the_launch_file(box):
 
 
 def test_the_launch_file_configures_where_it_is_told_to(box, tmp_path):
-    """With autostart: false in the YAML beside it, the node waits unconfigured for a manager of its
-    lifecycle."""
+    """With autostart: false the node waits for a manager."""
     for name in ("palpate.launch.py", "palpate.yaml"):
         text = (PARAMETERS.parent / name).read_text()
         (tmp_path / name).write_text(text.replace("autostart: true", "autostart: false"))

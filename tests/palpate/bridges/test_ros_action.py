@@ -29,8 +29,7 @@ def _installed() -> None:
 
 @pytest.fixture
 def node(box: SpeakingBox) -> Iterator[RosPeer]:
-    """A node that hears the box through a bridge with permission to command it, and knows its
-    labels."""
+    """A node that hears the box through a bridge that may command it, and knows its labels."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}", *WRITES):
         ready(box, peer)
         yield peer
@@ -78,8 +77,7 @@ def silent(heard: Sentence) -> list[bytes]:
 
 
 def test_a_sweep(box, node):
-    """START, the slide, STOP, the answer with all fields of RES; feedback announces the slide; NEW
-    if it is requested."""
+    """START, the slide, STOP, all fields of RES; feedback announces the slide; NEW on request."""
     found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True, speed_mm_s=30.1)
     assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
     counts = [found[name] for name in ("sweep", "code", "fused", "lost", "share")]
@@ -119,8 +117,7 @@ def test_what_was_not_ok(box, node):
 
 
 def test_one_at_a_time_and_canceled(box, node):
-    """A second goal is rejected and disturbs nothing; canceled, the box aborts its sweep; the next
-    goal works."""
+    """A second goal is rejected; canceled, the box aborts; the next goal works."""
     box.script = lambda s: [*obeying(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
     begun(node)
     assert swept(node)["state"] == "rejected"
@@ -134,8 +131,7 @@ def test_one_at_a_time_and_canceled(box, node):
 
 
 def test_unplugged_meanwhile(box, node):
-    """Aborted with the reason, at once; a goal without a line, too; plugged in again, the next
-    works."""
+    """Aborted with the reason, as is a goal without a line; plugged in, the next works."""
     begun(node)
     box.unplug()
     lost = later(node, 0)
@@ -150,8 +146,7 @@ def test_unplugged_meanwhile(box, node):
 
 
 def test_cleaned_up_meanwhile(box, node):
-    """The box's sweep is aborted before its line is closed, and the goal has its result; without a
-    line, goals are aborted; configured again, they work."""
+    """The sweep is aborted before the line is closed; configured again, goals work."""
     box.script = lambda s: [*silent(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
     begun(node)
     assert node.call("deactivate")["success"]
@@ -177,8 +172,7 @@ def test_the_bridge_ends_meanwhile(box):
 
 
 def test_commands_need_allow_writes(box):
-    """Without it neither action nor services reach the box, and no other node can set it; verdicts
-    come."""
+    """Without it nothing reaches the box, and no other node can set it; verdicts come."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}"):
         ready(box, peer)
         want = "commands are refused; start the bridge with -p allow_writes:=true"

@@ -1,5 +1,4 @@
-"""The TCP server of the bridges: a peer that reads nothing does not keep the program from
-ending."""
+"""The TCP server of the bridges: a peer that reads nothing does not hold the end."""
 
 from __future__ import annotations
 
@@ -42,8 +41,7 @@ async def _peers_after_the_end() -> int:
 
 
 def test_a_task_that_is_cancelled_as_bytes_arrive_ends():
-    """A cancelled task ends, in whichever turn of the loop the bytes came. With asyncio.wait_for of
-    Python 3.11 it went on, and the bridge never ended after SIGTERM."""
+    """In whichever turn: with 3.11's wait_for it went on for ever."""
 
     async def ends(turns: int) -> bool:
         reader = asyncio.StreamReader()

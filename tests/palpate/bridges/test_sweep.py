@@ -68,8 +68,7 @@ class Swept:
         return self.sweep.run(Wanted(**terms))
 
     def has_heard(self, *names: str) -> bool:
-        """Whether these are the commands that the box has heard, without questions; waits for
-        them."""
+        """Whether the box has heard these commands, without questions; waits for them."""
         eventually(lambda: len(self._heard()) >= len(names))
         return self._heard() == [*names]
 
@@ -156,8 +155,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_becomes_of_a_sweep(swept, monkeypatch, name):
-    """The answer or the error, the commands that the box has heard, and the phases. After an error
-    the box is not left with an open sweep if it can be reached."""
+    """Answer or error, commands, phases; after an error no sweep is left open in reach."""
     case = CASES[name]
     monkeypatch.setattr(sweep, "ABORTED_S", 0.1 if name == "canceled and not answered" else LONG_S)
     if case.lines is not None:
@@ -186,8 +184,7 @@ def test_start_has_the_speed_and_force_of_the_goal(swept):
 
 
 def test_canceled_when_the_answer_came(swept):
-    """The box has nothing to abort any more: the answer that it gave is the answer. A sweep that is
-    canceled before START is not begun."""
+    """The answer that came is the answer; before START nothing is begun."""
 
     def script(heard: Sentence) -> list[bytes]:
         return [result(1), NOTHING] if heard.kind == "ABORT" else obeying(heard)
@@ -209,8 +206,7 @@ def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept):
 
 
 def test_a_box_that_falls_silent(swept):
-    """Without a sentence for 3.5 s the sweep ends, long before its time limit. Each sentence begins
-    the 3.5 s anew: then only the time limit ends the wait."""
+    """After 3.5 s without a sentence, anew with each; then the time limit ends the wait."""
     swept.use(Hurried())
     swept.box.script = saying()
     with pytest.raises(NoAnswer, match=r"3\.5 s"):

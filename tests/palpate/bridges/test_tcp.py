@@ -1,5 +1,4 @@
-"""The serial line over TCP: the sentences and commands of peers; the pseudo-terminal
-that a box opens; limits."""
+"""The serial line over TCP: the sentences and commands of peers; the pseudo-terminal; limits."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ def url(address: Address) -> str:
 
 
 def test_the_client_works_through_it(box):
-    """The client of the serial line, on the other side of a network: a sweep from end to end, and
-    the answer of a hand with its fingers."""
+    """A sweep from end to end, and the answer of a hand with its fingers."""
     with (
         bridge("tcp", "--port", box.path, "--allow-writes") as address,
         Palpate(url(address), timeout_s=LONG_S) as client,
@@ -61,8 +59,7 @@ LONGEST = (
 
 
 def test_the_short_form_fits_a_string_of_80_characters(box):
-    """RES, STA and answers, the longest of each: sentences that the client reads, with status,
-    label and probability; nothing else is left out where it fits."""
+    """The longest of each kind: the client reads what counts."""
     lines = [sentence("RES", *LONGEST), state(), result(2)]
     with (
         bridge("tcp", "--port", box.path, "--short") as address,
@@ -98,8 +95,7 @@ def test_without_leave_questions_alone_are_passed_on(box):
 
 
 def test_every_peer_hears_everything_and_noise_stays_out(box):
-    """Two peers get the same sentences, and each the answers only to its own commands; damaged
-    sentences are not passed on."""
+    """The same sentences for two peers, answers to the asker alone."""
     with bridge("tcp", "--port", box.path) as address:
         peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
         for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
@@ -143,8 +139,7 @@ BROWSERS = {
 
 @pytest.mark.parametrize("pieces", BROWSERS.values(), ids=BROWSERS)
 def test_a_browser_commands_nothing(box, pieces):
-    """It is dropped at its first bytes, with leave to write; the box hears no START, and the other
-    peer is served."""
+    """It is dropped at its first bytes, with leave to write; the other peer is served."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         with socket.create_connection(address, timeout=LONG_S) as page:
             page.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -294,8 +289,7 @@ def test_a_box_that_does_not_answer(monkeypatch):
 
 
 def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
-    """The task does not go on, as it did with asyncio.wait_for of Python 3.11: then the bridge
-    never ended after SIGTERM."""
+    """With 3.11's wait_for the bridge never ended."""
 
     async def run() -> bool:
         bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
@@ -332,8 +326,7 @@ def test_a_silent_peer_makes_room():
 
 
 def test_a_box_opens_what_the_bridge_makes(tmp_path):
-    """--link: one name, for serial.port of a box on this machine. Bytes written before the bridge
-    came are not read later, and the name goes with the bridge."""
+    """--link for serial.port; earlier bytes are not read; it goes with the bridge."""
     path = tmp_path / "line"
     with bridge("tcp", "--link", path, "--allow-writes") as address:
         with (

@@ -53,8 +53,7 @@ def changed(files: dict[str, bytes], **arrays: np.ndarray) -> dict[str, bytes]:
 
 
 def test_the_bundle_stays_as_it_is(base, made, tmp_path):
-    """Its files do not change, and one file is added. All trained tensors are the same, and the id
-    is another."""
+    """One file is added; trained tensors are the same, and the id is another."""
     assert {name: data for name, data in made.items() if name != bundle.ENROLMENT} == base
     old, new = bundle.from_files(base, "old"), bundle.load(toy_bundle.put(tmp_path / "b", made))
     assert old.classes
@@ -76,8 +75,7 @@ def test_the_bundle_stays_as_it_is(base, made, tmp_path):
 
 
 def test_what_an_enrolment_cannot_say_is_computed(made):
-    """Bias and shape of a label are computed from its mean and number of sweeps, and are not in the
-    file."""
+    """Bias and shape follow from mean and number; the file has neither."""
     assert set(content(made)) == set(enrolled.ARRAYS)
     louder = changed(made, bias=np.float32([1e6, 1e6]), means_of_wood=np.zeros((3, 2), np.float32))
     new, old = bundle.from_files(louder, "louder"), bundle.from_files(made, "made")
@@ -134,8 +132,7 @@ WRONG = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made, case):
-    """An enrolment of another bundle, with wrong types or shapes, or out of range raises a
-    BundleError that says what to do."""
+    """Of another bundle, with wrong types or shapes, out of range."""
     changes, why = WRONG[case]
     check_refused(changed(made, **changes), why)
 
@@ -179,8 +176,7 @@ def test_a_bundle_without_class_means_takes_no_labels(made):
 
 
 def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(base, made):
-    """A forged label can only win itself. For any sweep the order of the trained labels does not
-    change."""
+    """A forged label can only win itself."""
     forged = changed(made, means=np.float32([[6, 0], [0, 0]]), spread=np.float32([1e6, 1e6]))
     it, before = (
         Classifier(bundle.from_files(files, "toy"), SystemClock()) for files in (forged, base)

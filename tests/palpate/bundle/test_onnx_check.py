@@ -1,5 +1,4 @@
-"""The check of a model and its trial: our own models pass, hostile models are refused with the
-reason, and what passes does no harm."""
+"""The check of a model and its trial: ours pass, hostile ones are refused or do no harm."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ SOUND = hostile.model([hostile.node("Relu", ["x"], ["y"])]).SerializeToString()
 
 @pytest.fixture(scope="module")
 def owns() -> list[mutated_models.Own]:
-    """Models of `palpate-train`, which together have all allowed operators except GRU and
-    MaxPool."""
+    """Our models, which together have all allowed operators except GRU and MaxPool."""
     return mutated_models.own_models(mutated_models.QUICK)
 
 
@@ -158,8 +156,7 @@ def test_an_output_of_another_shape_than_declared_fails_its_trial():
 @pytest.mark.thorough  # a sample of the campaign hostile
 @pytest.mark.parametrize(("enrolled", "count", "ran"), [(0.0, 150, 15), (1.0, 100, 5)])
 def test_fuzzed_models_neither_hang_nor_kill(enrolled, count, ran, owns, monkeypatch):
-    """Models and enrolments of the campaign run in children with limited memory and time. Enough of
-    them reach onnxruntime, and none gives a label without a probability."""
+    """Limited children; enough reach onnxruntime; no label without probability."""
     monkeypatch.setattr(hostile_fuzz, "ENROLLED", enrolled)
     record = hostile_fuzz.fresh(3)
     for told in hostile_fuzz.Fuzz(owns, 3).results(0, count):

@@ -25,8 +25,7 @@ def names(model: bytes, field: str) -> list[str]:
     "outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)]
 )
 def test_outputs_keep_their_bits(default_bundle, outputs):
-    """For golden sweeps and noise, each output of the pruned model equals that of the whole model
-    bit for bit."""
+    """Each output of the pruned model equals that of the whole model bit for bit."""
     whole, pruned = (
         session(default_bundle.model),
         session(prune(default_bundle.model, set(outputs))),
@@ -41,8 +40,7 @@ def test_outputs_keep_their_bits(default_bundle, outputs):
 
 
 def test_what_only_early_heads_need_is_gone(default_bundle):
-    """All nodes and constants of the heads are removed, and exactly those that the outputs need are
-    left."""
+    """Exactly the nodes and constants that the outputs need are left."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     graph = reader.read(pruned).graph
     needed = {name for node in graph.node for name in node.input} | set(names(pruned, "output"))
@@ -87,8 +85,7 @@ def test_declarations_of_what_is_gone_are_gone():
 
 
 def test_an_output_that_is_not_there_is_refused():
-    """The message names the missing output and the outputs of the model. Bytes that are not a model
-    are refused, too."""
+    """With the model's outputs; bytes that are not a model are refused, too."""
     with pytest.raises(BundleError, match="early"):
         prune(toy_bundle.model(), {"logits", "early"})
     with pytest.raises(BundleError, match=r"\['logits'\]"):

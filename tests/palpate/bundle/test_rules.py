@@ -1,5 +1,4 @@
-"""One contract for all rules in a manifest: each is read as it was written, and a value out of
-range is refused by its name."""
+"""One contract for all rules in a manifest: read as written, refused by name out of range."""
 
 from __future__ import annotations
 

@@ -48,8 +48,7 @@ def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings):
 
 
 def test_a_bundle_for_another_skin_is_refused_with_both_formats():
-    """A bundle for the same skin with another window is accepted, and any bundle if the skin is
-    unknown."""
+    """Another window is accepted, and any for an unknown skin."""
     format = RUNNING.format
     other = replace(
         RUNNING,
@@ -66,8 +65,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
 
 @deliveries.NEEDED
 def test_the_command_refuses_it_unless_it_is_told(tmp_path, capsys):
-    """`palpate bundles install` beside a service whose skin streams changes nothing; with
-    `--other-skin` the bundle is on trial."""
+    """`bundles install` changes nothing; with `--other-skin` it is on trial."""
     box = Delivery(tmp_path)
     held = toy_bundle.files()
     held[bundle.MANIFEST] = replace(

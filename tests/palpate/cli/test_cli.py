@@ -84,8 +84,7 @@ def test_run_prints_sentences_and_ends_with_its_script(capsys):
 
 
 def test_numpy_starts_no_threads_in_a_command():
-    """In an emulated box a product in the loop once waited for a thread of OpenBLAS until the
-    watchdog ended the service."""
+    """In an emulated box a thread of OpenBLAS once let the watchdog end it."""
     code = (
         "import os; from palpate.cli.main import main; main(['check', '--settings']);"
         "import numpy; print(len(os.listdir('/proc/self/task')))"
@@ -124,8 +123,7 @@ def test_run_on_a_serial_port():
 
 @pytest.mark.slow
 def test_kept_and_captured_sweeps_are_replayed(tmp_path, capsys):
-    """A black box, a capture, and the same sweeps recorded without a bundle, each replayed: the
-    same labels and probabilities."""
+    """A black box, a capture, and recorded sweeps: the same labels."""
 
     def output() -> list[list[str]]:
         return [fields[4:8] for fields in results(capsys)]
@@ -167,8 +165,7 @@ def test_a_log_on_a_full_disk_costs_the_log_alone():
 
 
 def test_replay_of_a_sweep_set(tmp_path, capsys, default_bundle):
-    """`run --sim replay:FILE`: each window of a set, over the wire, gets the verdict that the
-    window itself gets."""
+    """`run --sim replay:FILE`: each window, over the wire, gets its own verdict."""
     golden, n = default_bundle.golden, len(default_bundle.golden)
     both = np.concatenate([golden, golden[::-1]])
     sim = sweep_set(tmp_path / "set.npz", both, group_recording=np.repeat(np.arange(2), n))
@@ -183,8 +180,7 @@ def test_replay_of_a_sweep_set(tmp_path, capsys, default_bundle):
 
 @pytest.mark.slow
 def test_the_sequential_test_is_configured(tmp_path, capsys, default_bundle):
-    """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in
-    `replay`."""
+    """min_probability and max_sweeps reach the classifier, in `run` and `replay`."""
     box, known = Classifier(default_bundle, SystemClock()), []
     for counts in skin.sweep_set("T-REAL", 2000, 2)[0]:
         verdict = box(toy_bundle.sweep_of(counts))
@@ -209,8 +205,7 @@ def test_the_sequential_test_is_configured(tmp_path, capsys, default_bundle):
 
 
 def test_early_needs_a_bundle_that_can(tmp_path, capsys):
-    """classifier.early with a bundle without early heads ends before the first sweep; `check` names
-    it."""
+    """Without early heads it ends before the first sweep; `check` names it."""
     folder = Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
     manifest = json.loads((folder / bundle.MANIFEST).read_text()) | {"early": None}
     (folder / bundle.MANIFEST).write_text(json.dumps(manifest))
@@ -232,8 +227,7 @@ def test_early_needs_a_bundle_that_can(tmp_path, capsys):
     ],
 )
 def test_check_says_ok_part_by_part(capsys, sets, code, parts):
-    """On the rig all devices are present; a trigger without lines asks for none, and commands need
-    a port."""
+    """All devices are present; other triggers need no line, commands need a port."""
     assert main([*CHECK, *with_sets(*sets)]) == code
     lines = {line[6:20].strip(): line for line in capsys.readouterr().out.splitlines()}
     assert len(lines) == 5
@@ -245,8 +239,7 @@ def test_check_says_ok_part_by_part(capsys, sets, code, parts):
 
 @pytest.mark.slow
 def test_check_names_what_fails(tmp_path, capsys):
-    """On a machine without devices: the bundle is fine, the devices are not, each with its own
-    line, and exit code 1."""
+    """Without devices: the bundle is fine, each device has its line, exit code 1."""
     gone = with_sets(f"serial.port={tmp_path}/none", "skin.usb=1209:0001")
     assert main(["check", "--board", "rpi5", *gone]) == 1
     lines = {line[6:20].strip(): line[:4] for line in capsys.readouterr().out.splitlines()}
@@ -257,8 +250,7 @@ def test_check_names_what_fails(tmp_path, capsys):
 
 
 def test_check_needs_no_bundle(tmp_path, capsys):
-    """The skin is checked without a bundle. A bundle for another skin is named with both formats
-    and the remedy."""
+    """The skin is checked; a bundle for another skin is named with both formats."""
     assert main([*CHECK, *with_sets(f"classifier.bundle={tmp_path / 'none'}")]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [
@@ -274,8 +266,7 @@ def test_check_needs_no_bundle(tmp_path, capsys):
 
 
 def test_folders_and_files_that_are_not_there(tmp_path, capsys):
-    """Settings without a folder, a file of another kind, and a result without a place.
-    Nothing is begun."""
+    """Nothing is begun."""
     none, json_file = str(tmp_path / "none"), ["check", "--bench", "--json"]
     for words, code, said in (
         (["check", "--settings", "--config-dir", none], 78, none),
@@ -334,8 +325,7 @@ def test_a_full_disk_names_the_file_and_leaves_none(tmp_path):
 
 @pytest.mark.parametrize("form", ["", "4x4:uint8:750"])
 def test_record_on_a_machine_without_gpio(tmp_path, monkeypatch, capsys, form):
-    """A PC without wired lines, gpiod and bundle: sweeps by the clock are recorded, in the
-    announced or the described format."""
+    """Sweeps by the clock, in the announced or the described format."""
     how = argparse.Namespace(seed=1, sweeps=None, virtual=True)
     simulated = cli_devices.simulated("skin", None, how, config.load(None))
     plain = Devices(simulated.clock, None, simulated.backend, "sim")
@@ -354,8 +344,7 @@ def test_record_on_a_machine_without_gpio(tmp_path, monkeypatch, capsys, form):
 
 
 def test_record_takes_a_set_of_any_form(tmp_path, capsys):
-    """`record --sim replay:SET` of a skin without a bundle: each recorded window equals the window
-    of the set, after a warning that the skin is too slow for textures."""
+    """Each recorded window equals the set's, after a warning of a slow skin."""
     samples = np.random.default_rng(1).integers(100, 4000, (3, 40, 5, 3)).astype(np.int16)
     sim = sweep_set(tmp_path / "s.npz", samples, rate_hz=50.0)
     assert main(["record", "--sim", sim, "--virtual", "--out", str(tmp_path / "kept")]) == 0
@@ -368,8 +357,7 @@ def test_record_takes_a_set_of_any_form(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_space_bar_in_a_real_terminal(tmp_path):
-    """`palpate record --trigger key` as a person uses it: lines and no sentences; Ctrl-C ends it,
-    the terminal is as before."""
+    """As a person uses it: lines, no sentences; the terminal is as before."""
     far, near = os.openpty()
     before = termios.tcgetattr(near)
     words = ["record", "--sim", "skin", "--trigger", "key", "--material", "wood"]
@@ -546,8 +534,7 @@ def test_output_that_nobody_reads():
 
 
 def test_skin_check_prints_a_verdict_for_each_part(monkeypatch, capsys):
-    """On the simulated board all is ok, and no bundle is loaded; with a wrong CRC one line says
-    FAIL, and the exit code is 1."""
+    """All ok without a bundle; a wrong CRC is one FAIL and exit code 1."""
     words = ["skin", "check", "--sim", "skin", "--virtual"]
     assert main([*words, *with_sets("classifier.bundle=/nowhere")]) == 0
     told = capsys.readouterr()

@@ -18,8 +18,7 @@ def chip() -> gpio.SimGpio:
 
 
 def test_all_outputs_are_requested_low_and_given_back(chip, monkeypatch):
-    """Each output of the board is requested once, as an output at its low level, and released;
-    inputs are not touched."""
+    """Each once, at its low level, and released; inputs stay."""
     asked = []
     request = chip.request_lines
     monkeypatch.setattr(
@@ -56,8 +55,7 @@ def test_a_box_without_lines_has_nothing_to_lower(chip, capsys):
     ],
 )
 def test_what_cannot_be_lowered_is_said(chip, args, code, message, capsys):
-    """Lines of another program, or settings that cannot be read, cause one line and the exit code
-    of their kind."""
+    """Lines of others, or unreadable settings: one line and the exit code of the kind."""
     request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
     assert lower_outputs.main(args, chip) == code
     error = capsys.readouterr().err

@@ -1,5 +1,4 @@
-"""A robot gets answers of signed bundles only, unless a setting allows others; then all outputs say
-so."""
+"""A robot gets answers of signed bundles only, unless a setting allows others and is said."""
 
 from __future__ import annotations
 
@@ -33,8 +32,7 @@ def of(box: Delivery) -> list[str]:
 
 @pytest.mark.parametrize("command", [("run",), ("check",), ("run", "--shadow")])
 def test_a_robot_is_answered_by_signed_bundles_alone(box, command, capsys):
-    """`classifier.bundle` and `--shadow DIR` with an unsigned bundle: refused, with both remedies,
-    before anything else."""
+    """In service or as shadow: refused, with both remedies."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     if command == ("run", "--shadow"):
         main([*command, str(folder), *of(box)])  # then it ends, because no line is wired
@@ -82,8 +80,7 @@ def test_what_answers_no_robot_takes_any_bundle(box, capsys):
 
 
 def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypatch, capsys):
-    """While it is on, whatever runs; the status file has it for `palpate status`, and the feed for
-    the page."""
+    """While it is on; status file and feed have it."""
     monkeypatch.setattr(StatusFile, "stopping", lambda self: None)
     for options, said in ((ALLOWED, True), ((), False)):
         assert main(["run", *VIRTUAL, *of(box), *options]) == 0
@@ -96,8 +93,7 @@ def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypat
 
 
 def test_a_bench_may_allow_unsigned_bundles(box, capsys):
-    """With the setting an unsigned bundle starts, after a warning. Here the start fails, because no
-    trigger line is wired."""
+    """After a warning; here the start fails, since no trigger line is wired."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
     warning, *_, end = capsys.readouterr().err.splitlines()

@@ -29,8 +29,7 @@ SLID = {"measured_mm_s": 61.04, "direction": "cols-"}
 
 @pytest.mark.parametrize("status", list(Status))
 def test_an_answer_survives_its_sentence(status):
-    """All fields of RES, for each status, which is known, unsure, faulty, or final without a label
-    to use, and has its advice with the detail."""
+    """All fields of RES, for each status, with its advice and the detail."""
     read = Answer.read(result(verdict(status, "moved 2.1 mm"), "usb").decode())
     label = "wood" if status.classified else ""
     assert read == Answer(
@@ -44,8 +43,7 @@ def test_an_answer_survives_its_sentence(status):
 
 
 def test_the_answer_of_a_finger_survives_its_sentence():
-    """FIN is RES with the finger in front of its fields, `read` takes RES alone; with the longest
-    label and name the sentence is not cut before the detail."""
+    """FIN is RES after the finger; the longest is not cut early."""
     whole = sentences.read(result(verdict(detail="moved", **SLID), "usb").strip())
     fin = sentences.sentence("FIN", "left", *whole.fields)
     answer = Answer.of_finger(sentences.read(fin.strip()).fields)
@@ -62,8 +60,7 @@ def test_the_answer_of_a_finger_survives_its_sentence():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_optional_fields_survive_their_sentence(known):
-    """Field 14 says that the loss is unknown; speed and direction stand in 15 and 16, whether field
-    14 is empty or not. A reader of 14 fields finds the same answer without them."""
+    """14 to 16, in any combination; a reader of 14 fields does without."""
     plain = Answer.read(result(verdict(), "usb", loss_known=known).decode())
     assert (plain.loss_known, plain.measured_mm_s) == (known, None)
     line = result(verdict(detail="moved 2.1 mm", **SLID), "usb", loss_known=known).decode()
@@ -90,8 +87,7 @@ def test_optional_fields_survive_their_sentence(known):
     ],
 )
 def test_a_sentence_of_another_form_is_named(read, fields):
-    """Too few fields, a status that is not known, a word for a number: an error that repeats
-    them."""
+    """Too few fields, an unknown status, a word for a number."""
     with pytest.raises(FormatError, match="older") as e:
         read(fields.split(","))
     assert fields.removeprefix("left") in str(e.value)
@@ -120,8 +116,7 @@ def test_the_state_is_read_with_all_counts(skin, sweeping, ready):
     ("last", "degraded"), [((), ""), ((1,), ""), ((1, "silent row 2"), "silent row 2")]
 )
 def test_a_state_names_broken_taxels(last, degraded):
-    """Field 19 of STA; a box that bridges none does not send it. In a long line the names are cut
-    or left out, and no count is."""
+    """Field 19 of STA; in a long line names are cut or left out, no count is."""
     fields = ("1.000", "streaming", 0, 1, 2, 3, 4, 5, 6, "9f3c2a1b", "usb", *[0] * 6)
     line = sentences.read(sentences.sentence("STA", *fields, *last))
     assert BoxState.of(line.fields).degraded == degraded

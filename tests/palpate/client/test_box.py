@@ -1,5 +1,4 @@
-"""The client of the serial line: against a scripted box, against noise, unplugging and silence,
-against the real program."""
+"""The client of the serial line: a scripted box, noise, unplugging, silence, the real program."""
 
 from __future__ import annotations
 
@@ -46,8 +45,7 @@ def box(speaking: SpeakingBox) -> Iterator[Palpate]:
 
 
 def test_a_sweep_by_command(speaking, box):
-    """The example of the module: ready, START, STOP, the answer; the commands come in this
-    order."""
+    """The example of the module: ready, START, STOP, the answer."""
     box.new_object()
     box.start()
     box.stop()
@@ -83,8 +81,7 @@ def test_what_the_box_is(box):
 
 
 def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking, box):
-    """FIN sentences before a RES belong to it if they are of its sweep. The next answer has none of
-    them, and they do not count as answers."""
+    """FIN before RES, of this sweep alone; they are no answers."""
     speaking.say(finger("left", 6))
     speaking.say(finger("left", 7))
     speaking.say(finger("right", 7, "no-contact", "", "0.000"))
@@ -127,8 +124,7 @@ def test_answers_are_given_in_order_with_their_gaps(speaking):
 
 
 def test_a_restart_of_the_program_is_no_gap(speaking, box):
-    """Numbers begin anew: told once, whether an answer or a state shows it first; answers that it
-    gave meanwhile are counted."""
+    """Told once, whatever shows it first; answers meanwhile are counted."""
     speaking.say(result(40), state(answered=40), result(1), state(answered=1))
     box.result(LONG_S)
     assert box.result(LONG_S).missed == 0
@@ -226,8 +222,7 @@ def waiting(job: Callable[[], object]) -> tuple[threading.Thread, list[Appliance
 
 @pytest.mark.parametrize("job", [lambda box: box.ask("TEST"), lambda box: box.result(LONG_S)])
 def test_unplugging_ends_every_wait(speaking, box, job):
-    """A pending command ends with an error at once, and after plugging in the same client goes
-    on."""
+    """A pending command ends at once; after plugging in the client goes on."""
     speaking.script = lambda s: [] if s.kind == "TEST" else obeying(s)
     thread, errors = waiting(lambda: job(box))
     if "result" not in job.__code__.co_names:
@@ -244,8 +239,7 @@ def test_unplugging_ends_every_wait(speaking, box, job):
 
 
 def test_a_port_is_not_closed_while_a_command_is_written():
-    """The thread that reads finds it lost meanwhile: it closes the port when the command is out,
-    which then fails as lost."""
+    """The reading thread waits, and the command fails as lost."""
     began, closed, early = threading.Event(), threading.Event(), []
 
     class FailingPort:
@@ -273,8 +267,7 @@ def test_a_port_is_not_closed_while_a_command_is_written():
 
 
 def test_a_port_that_is_not_there(tmp_path):
-    """It is waited for: commands fail at once and name it, `wait_ready` fails at its deadline, also
-    where pyserial refuses."""
+    """Commands fail at once and name it, `wait_ready` at its deadline."""
     with Palpate(str(tmp_path / "ttyUSB0")) as box:
         with pytest.raises(NoAnswer, match=r"0\.05 s: .*ttyUSB0"):
             box.wait_ready(SHORT_S)
@@ -302,8 +295,7 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking, box):
 
 
 def test_more_than_a_pseudo_terminal_holds_arrives_whole(speaking, box):
-    """Simulators speak over one: it holds some 17 kB, and a read gives 4,095 bytes at most, so
-    sentences are cut anywhere."""
+    """A read gives 4,095 bytes at most: sentences are cut anywhere."""
     told = state() * (40_000 // len(state()))
     speaking.say(result(1), told, result(2), told, result(3))
     assert [box.result(LONG_S).sweep for _ in range(3)] == [1, 2, 3]
@@ -336,8 +328,7 @@ class ShiftedClock(SystemClock):
 
 
 def test_a_socket_in_place_of_a_port():
-    """`socket://host:port` as pyserial opens it; one that was closed, and one that says nothing, is
-    opened again."""
+    """`socket://host:port` by pyserial; closed or silent, it is opened again."""
     clock = ShiftedClock()
     with create_server(("127.0.0.1", 0)) as server:
         server.settimeout(LONG_S)

@@ -1,5 +1,4 @@
-"""The feed's reader: lines in parts, boxes that come, go, restart and speak another language, and
-`palpate run` itself."""
+"""The feed's reader: lines in parts, boxes that come, go, restart, and `palpate run` itself."""
 
 from __future__ import annotations
 
@@ -134,8 +133,7 @@ def test_a_loop_over_lines_ends_with_the_reason(feed, monkeypatch):
 
 
 def test_a_box_is_read_and_its_reason_is_kept(tmp_path):
-    """Silence does not end a connection, and verdicts come. After an invalid request the box's
-    reason is in `trouble`, and is a line of its own."""
+    """Silence ends nothing; the reason is in `trouble` and is a line."""
     offered = Offered(tmp_path / "feed.sock")
     offered.turns()
     with Feed(offered.path) as feed:
@@ -171,8 +169,7 @@ def running(path: Path) -> Iterator[subprocess.Popen]:
 
 @pytest.mark.slow
 def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path):
-    """One reader over two processes: hello again with another pid, though the first left its socket
-    behind. The second ends in order, sends its reason, and removes the socket."""
+    """One reader, two processes; the end gives its reason."""
     path = tmp_path / "feed.sock"
     pids = []
     with Feed(path, frames_hz=5, sweeps=True) as feed:

@@ -113,8 +113,7 @@ def test_a_damaged_file_is_moved_aside(path, caplog):
 
 @pytest.mark.parametrize("value", ["high", np.float32(0.9), np.bool_(True), b"1"])
 def test_wrong_kinds_are_refused(path, value):
-    """A text or a number of numpy is refused, and NaN is missing: none is stored as bytes, which
-    SQLite counts as 0."""
+    """Texts and numpy's numbers are refused, NaN is missing: SQLite would count bytes as 0."""
     file = VerdictFile(path)
     with pytest.raises(sqlite3.Error):
         file.add(NOW, verdict(1) | {"probability": value})
@@ -133,8 +132,7 @@ def test_in_memory(tmp_path, monkeypatch):
 
 
 def test_a_copy_during_writing(path, tmp_path):
-    """With its -wal the copy has every verdict; without it some may be missing, and the rest
-    is sound."""
+    """With its -wal it has every verdict; without it the rest is sound."""
     file = VerdictFile(path)
     for sweep in range(20):
         file.add(NOW, verdict(sweep))

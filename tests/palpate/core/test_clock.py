@@ -11,8 +11,7 @@ PACKET_NS = 4 * 1e9 / 750
 def errors_ms(
     ppm: float, seconds: float, seed: int, spikes: float = 0.01
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time in s, error of the clock in ms and error of a plain arrival stamp in ms, packet by
-    packet as a box sees them."""
+    """Time in s, errors in ms of the clock and of plain arrival stamps, packet by packet."""
     rng = np.random.default_rng(seed)
     clock = DeviceClock()
     n = round(seconds * 1e9 / PACKET_NS)
@@ -32,8 +31,7 @@ def errors_ms(
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_drift_and_spikes(ppm, seed):
-    """80 ppm and 1 % spikes of 5-40 ms: under 1 ms from the fifth second on, where the arrival time
-    alone is wrong by tens of ms."""
+    """80 ppm, spikes of 5-40 ms: under 1 ms from the fifth second on, unlike arrival times."""
     t_s, error, plain = errors_ms(ppm, 60, seed)
     assert np.abs(error[t_s >= 5]).max() < 1
     assert (error <= plain + 1e-3)[t_s >= 5].all()  # no frame was taken after it arrived
@@ -82,8 +80,7 @@ def test_slope_is_bounded():
 
 
 def test_system_clock_sleeps():
-    """The real clock reaches the time it sleeps to, and returns at once for a time that has
-    passed."""
+    """It reaches the time it sleeps to, and returns at once for one that has passed."""
     clock = SystemClock()
     until = clock.now_ns() + 2_000_000
     clock.sleep_until(until)
@@ -93,8 +90,7 @@ def test_system_clock_sleeps():
 
 @pytest.mark.parametrize("ppm", [80, -80, 0, 150])
 def test_frames_that_all_come_late_were_not_taken_late(ppm):
-    """A FIFO that stays 400 ms full for a minute shifts the clock by the crystals' drift, not by
-    400 ms."""
+    """400 ms late for a minute: the clock shifts by the drift alone."""
     clock, errors_ms = DeviceClock(), []
     for i in range(100 * 125):
         true_ns = i * 8_000_000
@@ -108,8 +104,7 @@ def test_frames_that_all_come_late_were_not_taken_late(ppm):
 @pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-2000, -500, 500, 2000])
 def test_no_line_is_kept_for_ever(ppm):
-    """A device clock beyond the bound whose first packets all came late: the error is that of the
-    last 20 s and stops growing."""
+    """Beyond the bound, first packets late: the error is that of the last 20 s."""
     rng, clock, arrival_ns, error_ms = np.random.default_rng(0), DeviceClock(), 0, []
     for true_ns in range(0, 150_000_000_000, 16_000_000):
         late_ns = 20e6 if true_ns < 5e9 else 1e6

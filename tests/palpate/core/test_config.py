@@ -46,8 +46,7 @@ def _shipped(board: str | None = None, *sets: str) -> config.Config:
 
 
 def test_later_layers_win_and_each_value_knows_its_source(folder):
-    """Defaults, skin.toml, board, site and --set each decide one value; of two --set the last
-    wins."""
+    """Each layer decides one value; of two --set the last wins."""
     (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nactive_low = true\n")
     sets = ("trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0")
     c = _load(folder, "a", *sets)
@@ -153,8 +152,7 @@ def test_set_takes_toml_or_a_bare_string(folder, option, value):
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
 def test_a_missing_board_lists_the_boards_there(folder, board):
-    """By option and by site file; no name leads out of the folder, and an invalid name is an
-    error."""
+    """By option and by file; no name leads out of the folder."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
     with pytest.raises(ConfigError, match=r"a, b$"):
         _load(folder)
@@ -266,8 +264,7 @@ def _page(board: str) -> str:
 
 
 def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
-    """The drawing in the comment of a board file: {pin: name}, {role: name}, a role with its arrow
-    as seen from the box."""
+    """The drawing of a board file: {pin: name}, {role: name}, a role with the box's arrow."""
     rows = re.findall(
         r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
         r"]+))?$",
@@ -288,8 +285,7 @@ def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
-    """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role
-    is at its line."""
+    """Each pin and role is where the header has it."""
     c = _shipped(board)
     pins, roles = _drawing(board)
     assert pins == HEADER
@@ -307,8 +303,7 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_dead_program_is_not_ready(board):
-    """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the
-    pull-down."""
+    """READY is low from power-on; the page asks for strict_gpiod and the pull-down."""
     assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
     for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
         assert words in _page(board)
@@ -321,8 +316,7 @@ def test_one_cable_fits_both_boards():
 
 
 def test_rules_and_unit_agree_with_the_settings():
-    """The udev rules have the skin's ids, and the unit's groups are those that sysusers makes and
-    the rules use."""
+    """udev rules have the skin's ids; the unit's groups are sysusers'."""
     skin = config.SkinConfig()
     rules = (FIRMWARE / "70-palpate.rules").read_text()
     assert (

@@ -49,8 +49,7 @@ def test_work_beyond_the_bound_is_refused_counted_and_told(logged):
 
 
 def test_a_fault_comes_back_to_the_loop():
-    """An unexpected exception of the work is raised where results are given back, and the thread
-    goes on."""
+    """It is raised where results are given back, and the thread goes on."""
     disk, done = DiskThread(), []
     disk(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
@@ -70,8 +69,7 @@ def test_the_end_waits_for_a_bounded_time(monkeypatch, logged):
 
 
 def test_a_slow_disk_costs_recordings_and_tells_so(tmp_path):
-    """A sweep that cannot be written is reported as failed, a written one as stored; no sweep that
-    is being written can be discarded."""
+    """Failed or stored, as it was; nothing is discarded while written."""
     disk, free = held(2)
     said: list[str] = []
     session = RecordingSession(

@@ -1,5 +1,4 @@
-"""Ctrl-C during the imports of both programs: real processes, and a library that waits to be
-interrupted while it loads."""
+"""Ctrl-C during the imports of both programs, as real processes."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ except BaseException as e:  # as extension modules do
 def _loading(
     module: str, argv: list[str], library: str, folder: Path, ignored: bool = False
 ) -> subprocess.Popen[str]:
-    """A process of `python -m module` that has begun to import `library`. ignored: it was started
-    with SIGINT ignored."""
+    """A process of `python -m module` that imports `library`. ignored: with SIGINT ignored."""
     (folder / f"{library}.py").write_text(LOADING)
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
     process = subprocess.Popen(
@@ -70,8 +68,7 @@ def test_ctrl_c_during_the_imports_is_one_line(program, module, argv, library, t
 
 @pytest.mark.slow
 def test_ctrl_c_during_a_late_import_is_one_line(tmp_path):
-    """A library that a command imports during its work: exit code 130 without a traceback, although
-    the command takes the library's error for a missing library."""
+    """Exit code 130, although it looks like a missing library."""
     (tmp_path / "tables").mkdir()
     (tmp_path / "tables" / "cork.parquet").write_bytes(b"PAR1")
     argv = ["import", "tables", "--pattern", "{material}.parquet", "--rate", "9", "--out", "s.npz"]

@@ -1,5 +1,4 @@
-"""The log: lines for a terminal and for the journal, levels, a full disk, and trouble that is
-logged once."""
+"""The log: lines for a terminal and the journal, a full disk, trouble that is logged once."""
 
 from __future__ import annotations
 
@@ -29,15 +28,13 @@ from palpate.core.log import LineHandler, SparseLog, TroubleLog, in_journal, log
     ],
 )
 def test_a_line_for_the_journal_and_for_a_terminal(text, level, journal, shown):
-    """A terminal shows the program's name and no priority; the journal knows the name and needs the
-    priority. Text of a device cannot control a terminal."""
+    """Name or priority; text of a device cannot control a terminal."""
     record = logging.LogRecord("palpate", level, "", 0, text, None, None)
     assert LineHandler(journal=journal).format(record) == shown
 
 
 def test_the_journal_is_known_by_its_stream(tmp_path):
-    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the
-    journal."""
+    """JOURNAL_STREAM must name this very stream."""
     with (tmp_path / "out").open("w") as f:
         status = os.fstat(f.fileno())
         environ = {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
@@ -67,8 +64,7 @@ def test_a_full_disk_costs_the_line_alone(monkeypatch):
 
 
 def test_trouble_is_logged_when_it_begins_changes_and_ends(logged):
-    """Each once, as a warning except the end; without a text for the end it has no line. A first
-    state that is not known is news."""
+    """Once each; a first unknown state is news."""
     trouble = TroubleLog("skin", "look at the cable", end="skin: streaming")
     for now in ("", "", "gone", "gone", "busy", "", "", "gone"):
         trouble.update(now)

@@ -73,8 +73,7 @@ def test_a_typed_name_keeps_its_label():
 
 
 def test_labels_of_the_bundle_are_taken():
-    """A name in another script gets no label that means something else there; one word in both
-    forms of Unicode is one material, also if a file holds it otherwise."""
+    """Another script gets no taken label; both forms of Unicode are one word."""
     known = TypedNames()
     known.add("material", None)
     known.add("Spuele", "Spu\u0308le")

@@ -37,8 +37,7 @@ STUDIES = (("fabrics", "--method", "H-svm"),)
     ids=lambda x: x[0] if isinstance(x, tuple) else "",
 )
 def test_no_command_writes_another_kind_of_file(run, words, name, tmp_path, capsys):
-    """Its name is in the message, nothing is read or written, and the exit code is that of bad
-    options or data."""
+    """Named; nothing is read or written; exit code of bad options."""
     out = tmp_path / name
     try:
         code = run([*words, "--out", str(out)])

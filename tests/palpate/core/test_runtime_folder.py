@@ -6,8 +6,7 @@ from palpate.core import runtime_folder
 
 
 def test_settings_are_read_if_a_file_may_speak_of_the_folder(tmp_path, monkeypatch):
-    """Also behind a link to nothing, as an editor leaves it, and in a file that is a folder; not
-    without any settings."""
+    """Also behind a dead link and in a folder's place."""
     folder, site = tmp_path / "settings", tmp_path / "site.toml"
     monkeypatch.setattr(runtime_folder, "CHECKOUT", str(folder))
     monkeypatch.setattr(runtime_folder, "SITE", str(site))

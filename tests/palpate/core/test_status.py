@@ -15,8 +15,7 @@ from tests.factories.paths import ROOT
 
 
 def test_all_that_is_said_of_a_status_is_of_the_table():
-    """PROTOCOL.md's list, the page of statuses, Modbus, the card of the page: each has every status
-    in the order of the codes, with the words of the table."""
+    """PROTOCOL.md, page, Modbus, card: every status, in order."""
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
     listed = protocol.split("| status | meaning")[1].split("\n\n")[0]
     assert re.findall(r"(?m)^\| `([a-z-]+)` \|", listed) == [*Status]
@@ -38,8 +37,7 @@ def test_every_reason_of_a_rule_has_words():
 
 
 def test_the_table_is_whole():
-    """A sweep without a label has a reason; an operator gets words for all but `ok`; only `ok` is
-    used."""
+    """No label has a reason; all but `ok` have words; only `ok` is used."""
     assert set(REASONS) == {s for s in Status if not s.classified}
     assert all(w.word and w.advice for s, w in WORDS.items() if s is not Status.OK)
     assert [s for s, w in WORDS.items() if w.robot == USE] == [Status.OK]

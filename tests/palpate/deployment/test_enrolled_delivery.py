@@ -1,5 +1,4 @@
-"""A bundle with an enrolled label in the store: trial, rollback, age, and each reason for a
-refusal."""
+"""A bundle with an enrolled label in the store: trial, rollback, age, and each refusal."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ def grown(box: Delivery, label: str = "cork") -> dict[str, bytes]:
 
 
 def test_a_label_is_on_trial_and_gone_back_from(box):
-    """A label is enrolled into a delivered bundle. The new bundle runs on trial and is committed;
-    `rollback` leads to the bundle without the label."""
+    """It is committed; `rollback` leads to the bundle without it."""
     one = box.committed(1)
     with_cork = box.store.learn(grown(box))
     chosen = box.store.choose()
@@ -45,8 +43,7 @@ def test_a_label_is_on_trial_and_gone_back_from(box):
 
 
 def test_a_second_label_and_the_packaged_bundle(box):
-    """The packaged bundle is trusted like the program. A second label is enrolled into the same
-    bundle."""
+    """The packaged bundle is trusted like the program."""
     first = box.store.learn(grown(box))
     second = box.store.learn(grown(box, "felt"))
     running = box.store.running()
@@ -58,8 +55,7 @@ def test_a_second_label_and_the_packaged_bundle(box):
 
 
 def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box):
-    """After a newer bundle was committed, labels that were enrolled into the older bundle are
-    refused. Delivering the running bundle again may remove its label."""
+    """Labels of an older one are refused after a newer."""
     box.committed(1)
     old = grown(box)
     with_cork = box.store.learn(old)
@@ -76,8 +72,7 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box):
 def check_refused(
     box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
 ) -> None:
-    """The box refuses these files, from a folder and from its own enrolment, and continues with the
-    same bundle."""
+    """From a folder and from its own enrolment; the box continues with the same bundle."""
     before = box.store.current
     for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.learn(files)):
         with pytest.raises(kind, match=why):
@@ -131,8 +126,7 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box):
 
 
 def test_a_program_with_another_packaged_bundle_does_not_take_the_label(box, monkeypatch):
-    """An upgrade replaced the base: the error says what to do, and `rollback` leads to the new
-    packaged bundle."""
+    """It says what to do; `rollback` works."""
     box.store.learn(grown(box))
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))

@@ -1,5 +1,4 @@
-"""The box's key for enrolments: made at the install, private, for nothing else; and the errors if
-the key is missing or damaged."""
+"""The box's key for enrolments: private, for nothing else; and the errors without it."""
 
 from __future__ import annotations
 
@@ -38,8 +37,7 @@ def test_a_bench_gets_a_key_of_its_own(tmp_path):
 
 
 def test_an_install_makes_a_private_key_once(key):
-    """Nobody else may read the key, it signs, and its signatures are valid. Another install changes
-    nothing."""
+    """It signs validly, and another install changes nothing."""
     assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
     assert (key.folder / SIGNER).stat().st_mode & 0o777 == 0o644
     assert key.folder.stat().st_mode & 0o777 == 0o750
@@ -52,8 +50,7 @@ def test_an_install_makes_a_private_key_once(key):
 
 
 def test_two_boxes_do_not_believe_each_other(key, tmp_path):
-    """A signature of another box, of other data, or for another use, and a cut signature are
-    refused."""
+    """Of another box, data or use, or cut: refused."""
     other = install_scripts.enrolment_key(tmp_path / "other")
     assert (other.folder / KEY).read_bytes() != (key.folder / KEY).read_bytes()
     good = key.sign(DATA)
@@ -71,8 +68,7 @@ def test_two_boxes_do_not_believe_each_other(key, tmp_path):
 
 
 def test_the_key_signs_no_bundle(key, tmp_path):
-    """Its signatures are not valid for bundles, even if an administrator adds its line to the
-    signers of bundles."""
+    """Even if an administrator adds its line to the signers of bundles."""
     signers = tmp_path / "allowed_signers"
     signers.write_text((key.folder / SIGNER).read_text())
     for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):
@@ -106,8 +102,7 @@ SPOILS: dict[str, tuple[Callable[[EnrolmentKey], None], str]] = {
 
 @pytest.mark.parametrize("spoil", SPOILS)
 def test_a_key_that_cannot_be_used_is_told_with_what_to_do(key, spoil):
-    """A key that is missing, readable by others, damaged, or of another box, or has no signer, is
-    reported in one line before the robot sweeps."""
+    """In one line before the robot sweeps."""
     spoiled, why = SPOILS[spoil]
     spoiled(key)
     with pytest.raises(ConfigError, match=why) as e:

@@ -1,5 +1,4 @@
-"""Shadow mode: how a candidate is compared with the bundle in service, and that it cannot affect
-the robot."""
+"""Shadow mode: how a candidate is compared, and that it cannot affect the robot."""
 
 from __future__ import annotations
 
@@ -92,8 +91,7 @@ A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
 
 
 def test_two_that_agree_are_counted_and_nothing_is_kept(side):
-    """The counts are written after a minute and at the end, not with each sweep; a sweep without a
-    window is not counted. The text has a Wilson interval."""
+    """Written once a minute and at the end; with an interval."""
     pair = side()
     none = types.Frames.empty(toy_bundle.FORMAT)
     pair.judge(A, B, replace(A, status=Status.SHORT, frames=none))
@@ -109,8 +107,7 @@ def test_two_that_agree_are_counted_and_nothing_is_kept(side):
 
 
 def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
-    """Sweep and counts are on the disk at the end of the turn; judged again, the sweep gives both
-    verdicts bit for bit."""
+    """At the end of the turn; bit for bit."""
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
@@ -128,8 +125,7 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
 
 
 def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
-    """During an open sweep sweeps are only counted. Afterwards one file is written in each turn, up
-    to the limit."""
+    """Afterwards one file in each turn, up to the limit."""
     monkeypatch.setattr(shadow, "KEPT", 2)
     pair = side(renamed)
     for one in (A, B):
@@ -144,8 +140,7 @@ def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
 
 
 def test_it_fuses_by_the_same_rule(side):
-    """The candidate also fuses the sweeps of one object, so neither bundle requests a third
-    sweep."""
+    """The candidate fuses an object's sweeps, so neither asks for a third."""
     pair = side(min_probability=0.9)
     pair.judge(
         toy_bundle.sweep(2.5, 0, 1, object=1),
@@ -180,8 +175,7 @@ def test_taxels_that_are_broken_over_the_stream_count_for_both(side):
 
 
 def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path):
-    """If the candidate has no early heads, or needs more of the sweep, the sweep is counted but not
-    compared."""
+    """Else the sweep is counted, not compared."""
     files = {"outputs": ("logits", "early"), "known": None}
     eager, slow = (
         toy_bundle.load(tmp_path / name, early=Early((least,) * 3, 1), **files)
@@ -204,8 +198,7 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path):
 
 
 class FailingClassifier:
-    """A candidate whose model fails on some sweeps, as onnxruntime does: with an exception of its
-    own."""
+    """A candidate whose model fails on some sweeps, with an exception of its own."""
 
     def __init__(
         self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
@@ -226,8 +219,7 @@ def strange() -> None:
 
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged):
-    """After three failures in a row, one line is logged and the candidate is stopped. A success
-    resets the count; computing for over a tenth of a second is a failure."""
+    """Three in a row or slow ones; one line; stopped."""
     pair = side()
     pair.shadow._classifier = FailingClassifier(
         pair.shadow._classifier, lambda s: s.id != 3, strange
@@ -251,8 +243,7 @@ def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged):
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path):
-    """The same pair continues its counts; for another candidate, or another current bundle, counts
-    and sweeps start anew."""
+    """Of either bundle."""
     pair = side(renamed)
     pair.judge(A)
     pair.shadow.stopping()
@@ -271,8 +262,7 @@ def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, t
 
 @pytest.mark.slow
 def test_a_candidate_that_kills_the_program_stays_away(side):
-    """After three starts in a row that died within a minute, the candidate is not loaded. An
-    orderly end, or a minute, resets the count."""
+    """After three starts that died; an order or a minute resets."""
 
     def start(judged_s: float) -> Shadow:
         pair = side()
@@ -308,8 +298,7 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch, logged):
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path, default_bundle):
-    """Another format, two large models, failing golden sweeps, and a folder that is a
-    file are errors that say what to try."""
+    """Another format, two large models, failing goldens, a folder's file."""
     with pytest.raises(BundleError, match="4x4"):
         side(lambda b: default_bundle)
     with pytest.raises(BundleError, match="together"):
@@ -346,8 +335,7 @@ def test_the_interval_is_wilson_s():
 
 
 def test_the_robot_notices_nothing(rigged, default_bundle, tmp_path):
-    """With a candidate that is always wrong, the simulated box sends the same sentences, and each
-    sweep is kept."""
+    """A candidate that is always wrong: the same sentences; each sweep is kept."""
     heard = []
     for beside in (False, True):
         clock = rig.VirtualClock()

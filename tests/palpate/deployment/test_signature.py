@@ -1,5 +1,4 @@
-"""Signatures: which signers a box trusts, and the errors where a signature is wrong or cannot be
-checked."""
+"""Signatures: which signers a box trusts, and the errors where one is wrong or unchecked."""
 
 from __future__ import annotations
 
@@ -61,8 +60,7 @@ def test_a_signer_is_named(tmp_path, kind):
 
 @pytest.mark.slow
 def test_a_signature_of_nobody_in_the_file_is_refused(signers):
-    """Another key, namespace or message, and a cut, empty or huge signature are refused. A byte
-    order mark and CR LF in the file of signers do no harm."""
+    """Also cut, empty, huge; a BOM and CR LF do no harm."""
     good = signature.sign(MESSAGE, signers.ours)
     for signed, message, why in (
         (signature.sign(MESSAGE, signers.theirs), MESSAGE, "signed by none"),
@@ -84,8 +82,7 @@ def test_a_signature_of_nobody_in_the_file_is_refused(signers):
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [("anna", "ben"), ("anna", "anna")])
 def test_the_order_of_two_lines_of_a_key_does_not_matter(signers: Signers, names: tuple[str, str]):
-    """One of them allows the key for git alone, the other for bundles: signed in either order, and
-    by whom is the other's name."""
+    """One for git alone, the other for bundles."""
     good = signature.sign(MESSAGE, signers.ours)
     lines = [line(signers.ours, names[0], 'namespaces="git" '), line(signers.ours, names[1])]
     for order in (lines, lines[::-1]):
@@ -144,8 +141,7 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers, te
     ],
 )
 def test_faults_of_ssh_keygen_that_pass_are_tried_again(monkeypatch, tmp_path, fault, code):
-    """Only a fault that a person can mend keeps the service down; being killed for want of memory
-    says nothing about the signature."""
+    """Only what a person can mend keeps the service down."""
 
     def fails(*words: object, **options: object) -> object:
         if isinstance(fault, Exception):
@@ -171,8 +167,7 @@ def test_an_ssh_keygen_that_hangs_is_ended(signers, monkeypatch):
 
 
 def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path, signers):
-    """`palpate-train sign` turns a bundle with an enrolment into an ordinary bundle with the same
-    labels and answers and another signer."""
+    """An ordinary bundle with the same answers."""
     folder = deliveries.put(
         tmp_path / "bundle", deliveries.enrolled(deliveries.files(1, None), None)
     )
@@ -196,8 +191,7 @@ def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path, signers):
 
 
 def test_signing_a_bundle(tmp_path, signers, capsys):
-    """`palpate-train sign` writes the counter into the manifest and the signature beside it. It
-    refuses to sign without a counter."""
+    """The counter is in the manifest; without a counter it refuses."""
     folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))
     with pytest.raises(BundleError, match="counter 0"):
         sign.sign(folder, signers.ours)

@@ -34,8 +34,7 @@ def box(tmp_path: Path) -> Delivery:
 
 
 def test_a_fresh_box_runs_the_packaged_bundle(box):
-    """Nothing was deployed: no current bundle, nothing to commit, nothing to go back to, no store
-    folder needed."""
+    """Nothing current, nothing to commit or go back to, no folder."""
     assert box.start() == PACKAGED
     assert not box.store.commit()
     nowhere = store.Store(StoreConfig(folder=str(box.folder / "none")), prove=lambda b: None)
@@ -114,8 +113,7 @@ def test_what_runs_after(box, name):
 
 @pytest.mark.slow
 def test_the_table_says_what_a_person_wants_to_know(box, logged):
-    """One line a bundle: role, id, name, counter, signer, trial; why a bundle was left is logged
-    once and stays in the table."""
+    """One line a bundle; a reason to leave it is logged once."""
     one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
     box.start()
     lines = bundle_commands.lines(bundle_commands.entries(box.store))
@@ -183,8 +181,7 @@ BAD: dict[str, tuple[Ways, str]] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_bundle_is_refused_and_leaves_nothing(box, name):
-    """A bad bundle is refused with its reason. The current bundle, the state and the folder of
-    bundles do not change."""
+    """With its reason; bundle, state and folder do not change."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
     before = box.store.state
     make, why = BAD[name]
@@ -233,8 +230,7 @@ def hang(held: Bundle) -> None:
     ids=["dies", "asks for memory", "raises", "hangs"],
 )
 def test_a_model_that_kills_its_runtime_is_refused(tmp_path, monkeypatch, does, why):
-    """The model runs in a child process. This process continues, and reports what became of the
-    child."""
+    """It runs in a child, and what became of it is said."""
     if does is hang:
         monkeypatch.setattr("palpate.deployment.sandbox.DEADLINE_S", 0.2)
     box = Delivery(tmp_path, does)
@@ -245,8 +241,7 @@ def test_a_model_that_kills_its_runtime_is_refused(tmp_path, monkeypatch, does, 
 
 @pytest.mark.slow
 def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box, logged):
-    """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle
-    runs."""
+    """The committed bundle runs."""
     one = box.committed(1)
     two = box.installed(2)
     (box.store.bundles.at(two) / bundle.MODEL).write_bytes(b"rotten")
@@ -266,8 +261,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box, l
 
 
 def test_a_committed_bundle_that_is_refused_stops_the_box(box):
-    """The box does not choose another bundle by itself. The error names the way back, and that way
-    works."""
+    """No other is chosen; the named way back works."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     with pytest.raises(BundleError, match="rollback"):
@@ -276,8 +270,7 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box):
 
 
 def test_what_was_changed_by_hand_is_refused(box):
-    """Another complete and signed bundle under the name of the current one; then a link out of the
-    store."""
+    """Another signed bundle under its name; a link out of the store."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     shutil.copytree(box.store.bundles.at(one), box.store.bundles.at(two))
@@ -291,8 +284,7 @@ def test_what_was_changed_by_hand_is_refused(box):
 
 
 def test_a_removed_state_is_told(box, logged):
-    """Without the state nothing is known of committed counters: each start and each delivery say
-    so. A new box says nothing."""
+    """Committed counters are unknown: said at starts and deliveries; not on a new box."""
     box.committed(5)
     assert not any("missing" in line for line in logged)
     Path(box.how.folder, "bundles.json").unlink()
@@ -351,8 +343,7 @@ def test_a_candidate_waits_and_is_promoted(box):
 
 
 def test_one_command_at_a_time(box, monkeypatch):
-    """A second command waits for a limited time. Only the owner of the folder may change the
-    store."""
+    """A second waits for a limited time; only the owner may change the store."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
     box.installed(1)
     with box.store._locked(), pytest.raises(ApplianceError, match="use"):
@@ -364,8 +355,7 @@ def test_one_command_at_a_time(box, monkeypatch):
 
 @pytest.mark.slow
 def test_a_disk_that_takes_no_note_runs_what_was_committed(box, monkeypatch, logged):
-    """A bundle on trial is not started if the start cannot be counted: a loop of crashes would go
-    unnoticed."""
+    """An uncounted start could loop for ever."""
 
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, "No space left on device", str(path))
@@ -414,8 +404,7 @@ def test_no_altered_bundle_is_accepted(tmp_path):
 
 
 def test_a_slow_check_does_not_count_against_a_trial(tmp_path, monkeypatch):
-    """ssh-keygen that takes too long ends the start with an exit code that is restarted, as often
-    as it likes, and the bundle stays on trial."""
+    """ssh-keygen too slow: restarted, and still on trial."""
     box = Delivery(tmp_path)
     box.committed(1)
     two = box.installed(2)
@@ -434,8 +423,7 @@ def test_a_slow_check_does_not_count_against_a_trial(tmp_path, monkeypatch):
 
 
 def test_memory_that_is_short_at_a_start_counts_and_the_trial_goes_on(tmp_path):
-    """The program ends with an exit code that is restarted. Once there is memory, the bundle on
-    trial runs; a bundle that never gets enough gives way after MOST_STARTS."""
+    """Restarted; it gives way after MOST_STARTS."""
     short: list[str] = []
 
     def prove(bundle: Bundle) -> None:

@@ -1,5 +1,4 @@
-"""A bundle on trial: which starts count, how the trial ends, and that classifying goes on during
-trouble with the disk."""
+"""A bundle on trial: which starts count, how it ends, and trouble with the disk."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def verdict(label: str = "Canvas") -> Verdict:
 
 
 class Trying(Delivery):
-    """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600
-    s."""
+    """A box with bundle 1 committed and 2 on trial, for 5 sweeps or 600 s."""
 
     def __init__(self, folder: Path, ready: Ready) -> None:
         """ready: the store of such a box, with the sha256 of both bundles."""
@@ -84,8 +82,7 @@ def booted(box: Trying, name: str) -> None:
 
 
 def test_power_cuts_do_not_count_against_the_bundle(box):
-    """After power cuts in its trial the bundle still runs. A crash within one boot counts,
-    also after power cuts."""
+    """A crash within one boot counts, also after power cuts."""
     for cut in range(3):
         booted(box, f"boot {cut}")
         assert box.start() == box.two
@@ -114,8 +111,7 @@ def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(bo
 
 
 def test_a_start_counts_until_the_program_ends_in_order(box):
-    """A start that crashes stays counted, also over power cuts after orderly ends, which are not
-    counted. A person's commit ends the trial."""
+    """Also over power cuts; a person's commit ends the trial."""
     booted(box, "first")
     box.tried()
     for boot in ("second", "third"):
@@ -159,8 +155,7 @@ def test_nothing_is_written_while_nothing_is_new(box):
 
 
 def test_enough_sweeps_commit(box, logged):
-    """Sweeps with a label count, and the commit waits until no sweep is open. Afterwards older
-    bundles are refused."""
+    """Sweeps with a label, once none is open; older bundles are refused then."""
     trial = box.tried()
     for _ in range(box.how.trial_sweeps - 1):
         trial.answered(verdict())
@@ -197,8 +192,7 @@ def test_enough_time_commits(box):
 
 
 def test_what_an_orderly_run_has_shown_counts_in_the_next(box):
-    """A robot that is switched off each evening also commits its bundle. The progress of a crashed
-    start is lost."""
+    """The progress of a crashed start is lost."""
     for n in range(2):
         trial = box.tried()
         trial.turn(health(0))
@@ -226,8 +220,7 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box):
     ids=repr,
 )
 def test_what_ends_the_program_decides_whether_the_start_counts(box, error, counts):
-    """Missing hardware and a person who stops the program do not count; an error that the bundle
-    may have caused does."""
+    """Missing hardware and a person do not."""
     with suppress(type(error)), box.tried():
         if error:
             raise error

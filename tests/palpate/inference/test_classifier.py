@@ -1,5 +1,4 @@
-"""Bundle and classifier: altered files are refused with the reason, and fusion follows the paper
-and Bayes."""
+"""Bundle and classifier: altered files are refused; fusion follows the paper and Bayes."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ def toy_folder(tmp_path: Path) -> Path:
 
 
 def test_fusion_is_the_papers_and_bayes():
-    """Equation 10 without overflow, the normalized product, and the most frequent label, of equally
-    frequent labels the first. A sweep with probability 1 does not outweigh three that disagree."""
+    """Equation 10, product, vote; one certain sweep does not outweigh three."""
     z = np.array([1.0, 2.0, -3.0])
     assert softmax(z) == pytest.approx(np.exp(z) / np.exp(z).sum())
     assert softmax(np.array([1e4, 0.0])).tolist() == [1.0, 0.0]
@@ -110,8 +108,7 @@ def test_a_machine_that_computes_the_checks_otherwise_is_refused(default_bundle,
 
 
 def test_verdict_carries_what_is_known(default_bundle):
-    """Label, probability, margin, fused and bundle id; probabilities add up to one. Below the
-    threshold the label is still reported, but not as ok."""
+    """All fields; below the threshold the label is reported, but not as ok."""
     sweep = replace(sweep_of(default_bundle.golden[0], lost=1), complete_ns=1000)
     v = box(default_bundle)(sweep)
     assert v.latency_ns == v.time_ns - 1000
@@ -155,8 +152,7 @@ def of_features(weights: np.ndarray) -> dict[str, bytes]:
 
 
 def test_features_go_through_the_same_runtime():
-    """A bundle with input L gets its three features: a linear model gives the same logits as
-    numpy, and a model of four features is refused."""
+    """Input L gets three features, as by numpy; of four it is refused."""
     weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
     made = bundle.from_files(of_features(weights), "here")
     want = features.compute("L", made.golden[0], 750.0) @ weights
@@ -207,8 +203,7 @@ NO_CONTACT = {"contact": None, "full_scale": 255.0}
     ],
 )
 def test_broken_manifests_are_named(folder, changes, hint):
-    """Unknown schema, input, key; labels that cannot be sent; files that are not named; labels that
-    do not fit."""
+    """Schema, input, key, labels, files, and labels that do not fit."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(edit(folder, **changes))
 
@@ -225,8 +220,7 @@ def test_a_bundle_may_know_the_unloaded_skin(folder):
 
 
 def test_what_is_no_bundle_is_refused(tmp_path, folder, default_bundle):
-    """A folder without a manifest, a manifest that is not JSON, golden sweeps of another format or
-    with Python objects, and a model that onnxruntime cannot open."""
+    """No or bad manifest, pickles, another format, no model."""
     with pytest.raises(BundleError, match="bundle"):
         bundle.load(tmp_path)
     (tmp_path / bundle.MANIFEST).write_text("{")
@@ -246,8 +240,7 @@ def test_what_is_no_bundle_is_refused(tmp_path, folder, default_bundle):
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 @pytest.mark.parametrize("axes", [1, 3])
 def test_golden_sweeps_are_packed_without_loss(dtype, axes):
-    """Every value of every type is the same after unpacking, even if changes wrap. Smooth sweeps
-    need less space."""
+    """Even where changes wrap; smooth sweeps need less space."""
     format = SweepFormat(2, 3, 100.0, 50, dtype, axes)
     rng = np.random.default_rng(1)
     any_bits = rng.integers(0, 256, (2, 50, *format.shape, format.numpy_type.itemsize), np.uint8)
@@ -347,8 +340,7 @@ def displaced(**changes: Any) -> dict[str, Any]:
     ],
 )
 def test_broken_early_and_known_are_named(toy_folder, changes, hint):
-    """Numbers out of range, fields that are missing or unknown, `known` without means.npz and the
-    reverse."""
+    """Out of range, missing or unknown fields, one without its means.npz."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(edit(toy_folder, **changes))
 
@@ -431,8 +423,7 @@ def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path, more, fine):
 
 
 def test_a_far_sweep_is_unknown(toy):
-    """Up to 3 deviations from the nearest mean a sweep is known, beyond it has no label and no
-    scores. A fault of the window has precedence."""
+    """Beyond 3 deviations: no label, no scores; a fault of the window comes first."""
     it = box(toy)
     assert it(toy_bundle.sweep(-3, 0)).label == "a"
     assert it(toy_bundle.sweep(9, 0)).label == "b"
@@ -447,8 +438,7 @@ def test_a_far_sweep_is_unknown(toy):
     ("strangers", "known"), [("strict", 1), ("balanced", 2), ("loose", 3), (None, 2)]
 )
 def test_the_box_chooses_a_limit(toy: Bundle, strangers: str | None, known: int):
-    """Of sweeps ever farther from a mean a looser limit knows more. Without a choice the limit is
-    balanced."""
+    """A looser limit knows more; without a choice it is balanced."""
     three = replace(toy_bundle.KNOWN, strict=4.0, loose=16.0)
     made = replace(toy, manifest=replace(toy.manifest, known=three))
     it = box(made, **{"strangers": strangers} if strangers else {})
@@ -468,8 +458,7 @@ def test_an_unknown_sweep_does_not_count_for_its_object(toy):
 
 
 def test_a_model_that_gives_no_number_is_unknown(tmp_path):
-    """Weights that overflow with large float32 counts: no label, no NaN, and the object's other
-    sweeps are unaffected."""
+    """No label, no NaN; the object's other sweeps are unaffected."""
     format = replace(toy_bundle.FORMAT, dtype="float32")
     made = toy_bundle.files(format=format, outputs=("logits",), known=None, scale=1e28)
     manifest = bundle.Manifest.parse(made[bundle.MANIFEST])
@@ -494,8 +483,7 @@ def borderline(**more: Any) -> Sweep:
 
 
 def test_sweeps_are_requested_until_the_probability_suffices(toy):
-    """Unsure, unsure, ok: after n sweeps the odds are the odds of one sweep to the power n. A
-    further sweep is fused, too."""
+    """After n sweeps the odds are to the power n."""
     it = box(toy, min_probability=0.85, max_sweeps=5)
     given = [it(borderline(object=1)) for _ in range(4)]
     assert [v.status for v in given] == [Status.UNSURE] * 2 + [Status.OK] * 2
@@ -506,8 +494,7 @@ def test_sweeps_are_requested_until_the_probability_suffices(toy):
 
 
 def test_at_the_limit_the_answer_is_final(toy):
-    """The answer is undecided, with label and probability. A robot that continues is answered by
-    the same rule, and may get ok."""
+    """Undecided, with its label; a robot that continues may get ok."""
     it = box(toy, min_probability=0.85, max_sweeps=2)
     given = [it(borderline(object=1)) for _ in range(3)]
     assert [v.status for v in given] == [Status.UNSURE, Status.UNDECIDED, Status.OK]
@@ -519,8 +506,7 @@ def test_at_the_limit_the_answer_is_final(toy):
 
 @pytest.mark.parametrize(("object", "fusion"), [(0, "product"), (1, "none")])
 def test_sweeps_that_stand_alone_never_reach_the_limit(toy, object, fusion):
-    """Without NEW OBJECT, or without fusion, each sweep is answered alone. A limit of one makes the
-    answer final."""
+    """Without objects or fusion; a limit of one is final."""
     for limit, status in ((2, Status.UNSURE), (1, Status.UNDECIDED)):
         it = box(toy, fusion, min_probability=0.85, max_sweeps=limit)
         assert [it(borderline(object=object)).status for _ in range(3)] == [status] * 3
@@ -550,8 +536,7 @@ def test_what_is_not_ok_need_not_count(toy):
 
 
 def test_an_enrolled_label_changes_all_logits(tmp_path):
-    """The logits are (means . z + bias) / temperature. The nearest label wins, and an enrolled
-    label's spread is wider by 1 + 1 / n."""
+    """(means . z + bias) / temperature, its spread wider by 1 + 1 / n."""
     bias = np.float32([0, -18, -18 + 2 / 4])
     arrays = toy_bundle.means(bias=bias, sweeps=np.array([0, 0, 2]))
     it = box(toy_bundle.load(tmp_path / "toy", arrays=arrays, labels=2))
@@ -586,8 +571,7 @@ def test_means_of_another_training_are_found(toy_folder, arrays):
 
 
 def test_of_equal_probabilities_the_first_label_is_reported(default_bundle):
-    """Like argmax: equal votes of neighbours, or coarse logits, must give the same label as at
-    export."""
+    """Like argmax, the same label as at export."""
     scores = np.array([0.0, 0.4, 0.0, 0.4, 0.1, 0.1])
     it = box(default_bundle)
     verdict = it.verdict(it.judged(sweep_of(default_bundle.golden[0]), told(it, scores)))

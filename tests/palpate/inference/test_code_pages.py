@@ -38,8 +38,7 @@ def it(default_bundle: Bundle) -> Classifier:
 
 
 def test_what_is_given_back_is_read_again(it):
-    """None of the code stays in memory. The next answer is the same, bit for bit, and reads a part
-    of it again."""
+    """The next answer is the same, bit for bit, and reads a part again."""
     golden = it.bundle.golden[0]
     want, before = it.logits(golden), resident_code()
     assert give_back(LIBRARY) > 1024 * before > 0
@@ -57,8 +56,7 @@ def test_opening_a_model_gives_its_code_back(default_bundle):
 
 
 def test_nothing_else_is_touched(tmp_path):
-    """Without a file of this name, or a list of mappings, nothing is released. Data and writable
-    code stay."""
+    """Without the file or the list nothing; data and writable code stay."""
     assert give_back("/no/such/library.so") == 0
     assert give_back(LIBRARY, tmp_path / "maps") == 0
     lines = [

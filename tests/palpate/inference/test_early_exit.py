@@ -1,5 +1,4 @@
-"""Early exit on simulated devices, with a toy graph whose heads can be computed by hand; and each
-failure."""
+"""Early exit on simulated devices, with heads that can be computed by hand; and each failure."""
 
 from __future__ import annotations
 
@@ -77,8 +76,7 @@ def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool =
 
 
 def slid(*differences: int) -> np.ndarray:
-    """A slide [SLIDE, 2, 2] with the given left minus right in each fifth of the window; the last
-    value holds to the end. All taxels move by the same."""
+    """A slide [SLIDE, 2, 2] with left minus right in each fifth; the last value holds."""
     diff = np.repeat(differences, FMT.window // 5)[: FMT.window]
     diff = np.concatenate([diff[:1].repeat(LEAD), diff, diff[-1:].repeat(SLIDE)])[:SLIDE]
     frames = np.full((SLIDE, 2, 2), 100)
@@ -87,8 +85,7 @@ def slid(*differences: int) -> np.ndarray:
 
 
 def acts(*slides: np.ndarray, new_object: tuple[int, ...] = ()) -> list[rig.Act]:
-    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts with these
-    numbers."""
+    """Finger off, a slide from edge to edge, off; NEW OBJECT before these acts."""
     off = np.zeros((40, 2, 2), np.uint8)
     return [
         rig.Act(np.concatenate([off, s, off]), 40, 40 + SLIDE, "left", i in new_object)
@@ -144,8 +141,7 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
     ],
 )
 def test_the_rule(scores, agree, want):
-    """An answer needs the step's least probability and the same label in the last `agree` steps. A
-    least probability above 1 is never reached."""
+    """The step's least probability and the same label in the last `agree` steps; above 1 never."""
     rule = Early((0.9, 0.8, 1.1, 0.5), agree)
     assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
 
@@ -166,8 +162,7 @@ def test_an_early_answer(rigged):
 
 @pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
 def test_otherwise_the_answer_is_the_usual_one(rigged, sets, least):
-    """With early exit off, or if no step is sufficient, the middle window is answered once, bit for
-    bit the same."""
+    """Off or insufficient: the middle window, once, bit for bit."""
     (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
     simulated = simulated_slides(slid(20, 20))
     (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
@@ -177,8 +172,7 @@ def test_otherwise_the_answer_is_the_usual_one(rigged, sets, least):
 
 
 def test_the_robot_stops_and_is_faster(rigged):
-    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share, the
-    rest of a packet, 20 ms to react, and up to the next frame."""
+    """Each touch is as short as its share, the packet, and 20 ms to react."""
     simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
@@ -234,8 +228,7 @@ def test_a_start_edge_with_the_answer(rigged):
 
 
 def test_a_robot_that_slides_on_gets_no_second_answer(rigged):
-    """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as
-    usual."""
+    """The usual stop edge gives none; the next sweep is usual."""
     simulated = simulated_slides(slid(60), slid(60), stops=False)
     assert summary(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
     assert [a.stop - a.start for a in simulated.robot.played] == [SLIDE] * 2
@@ -243,8 +236,7 @@ def test_a_robot_that_slides_on_gets_no_second_answer(rigged):
 
 @pytest.mark.parametrize("packet_frames", [1, 7, 30])
 def test_how_frames_come_changes_nothing(rigged, packet_frames):
-    """Single frames, or packets that hold a step and a half: the same steps, the same scores bit
-    for bit."""
+    """Single or packets over a step: the same scores bit for bit."""
     slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
     want = all_of(rigged(simulated_slides(*slides), SETS, toy()))
     have = all_of(rigged(simulated_slides(*slides, packet_frames=packet_frames), SETS, toy()))
@@ -253,8 +245,7 @@ def test_how_frames_come_changes_nothing(rigged, packet_frames):
 
 
 def test_one_run_of_the_graph_at_each_step(rigged, monkeypatch):
-    """The heads run four times for a sweep without early answer, twice for one answered at step
-    two, never when idle. The window is completed by repeating the newest frame."""
+    """Four times, or two for step two; the newest frame completes it."""
     asked: list[int] = []
     rests: list[np.ndarray] = []
     heads = Classifier.outputs
@@ -288,8 +279,7 @@ def spoiled(fault: str) -> np.ndarray:
 
 @pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact", ""])
 def test_a_spoiled_skin_is_not_decided_early(rigged, fault):
-    """For any output of the heads the whole sweep reports the fault. Without the fault the answer
-    is early."""
+    """The whole sweep reports the fault; without it, it is early."""
     want = [(fault, "", 1.0)] if fault else [("ok", "left", 0.2)]
     assert answers(rigged, spoiled(fault), model=toy((0.5,) * STEPS)) == want
 
@@ -322,8 +312,7 @@ def test_a_tare_counts():
     ],
 )
 def test_missing_frames(rigged, at, lost, counted, want):
-    """Two lost frames, also at the end of a step, are interpolated and counted. A wider gap
-    prevents an early answer."""
+    """Two lost ones, also at a step's end, are interpolated; a wider gap prevents it."""
     simulated = simulated_slides(slid(-10, 60), packet_frames=1)
     count = itertools.count(-40 - LEAD - at)
     simulated.backend.mangle = lambda data: b"" if 0 <= next(count) < lost else data
@@ -343,8 +332,7 @@ def test_missing_frames(rigged, at, lost, counted, want):
     ],
 )
 def test_what_goes_wrong_after_the_answer(rigged, what, want):
-    """After unplugging, another start, an abort or lost edges, the early answer stays the only
-    answer to its trigger."""
+    """Unplugging, another start, abort, lost edges: no other answer."""
     simulated = simulated_slides(slid(60), stops=False)
     box = rigged(simulated, SETS, toy())
     verdicts = box.until(lambda: box.box.answered == 1)
@@ -380,8 +368,7 @@ def test_what_goes_wrong_before_the_answer(rigged):
 
 
 def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged):
-    """Three sweeps of an object, the second whole since sigmoid(2) is below 0.9: fused 1, 2, 3,
-    with the product of their probabilities."""
+    """Fused 1, 2, 3, with the product."""
     simulated = simulated_slides(slid(60), slid(20), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, SETS, toy()))
     assert [(v.fused, v.share) for v in verdicts] == [(1, 0.2), (2, 1.0), (3, 0.2)]
@@ -390,8 +377,7 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged):
 
 
 def test_without_ok_the_sweep_goes_on(rigged):
-    """One sweep does not reach `min_probability`, so its answer is not early and requests another
-    sweep. Fused with that, the answer is early."""
+    """Not early below `min_probability`; fused with the next, it is."""
     simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
     verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
     found = [(str(v.status), v.fused, v.share) for v in verdicts]
@@ -399,8 +385,7 @@ def test_without_ok_the_sweep_goes_on(rigged):
 
 
 class Ticking(rig.VirtualClock):
-    """Each call takes a microsecond, so that the events of one turn have different times, as on a
-    real machine."""
+    """Each call takes a microsecond, so that events of one turn have different times."""
 
     def now_ns(self) -> int:
         """A little later than before."""
@@ -411,8 +396,7 @@ class Ticking(rig.VirtualClock):
 @pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 30])
 def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
-    """With lost packets, early, whole and fused answers, and a stop edge anywhere near the last
-    step, the replay is the same."""
+    """Lost packets, any answer, a stop edge near the last step."""
     rng, model = np.random.default_rng(7), toy((0.97, 0.95, 0.93, 0.7))
     slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]
     simulated = simulated_slides(
@@ -458,8 +442,7 @@ def recorded(path: Path, windows: np.ndarray) -> Path:
 
 
 def test_the_command_replays_what_it_decided(tmp_path, capsys):
-    """`palpate run` on a set with a capture and kept sweeps, then `palpate replay` of each: the
-    same answers."""
+    """`run` with a capture and kept sweeps, then `replay` of each."""
     model, folder = toy(), tmp_path / "toy"
     folder.mkdir()
     golden = bundle.golden_file(model.golden, model.golden_logits)
@@ -488,8 +471,7 @@ def test_the_command_replays_what_it_decided(tmp_path, capsys):
 
 
 def test_a_set_is_played_so_that_early_answers_see_it(tmp_path):
-    """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in
-    the middle."""
+    """`sweep.lead_ms` after the start edge, in the middle."""
     windows = np.random.default_rng(0).integers(0, 256, (2, 100, 2, 2)).astype(np.uint8)
     played = script.load(recorded(tmp_path / "s.npz", windows), FMT)
     for act, window in zip(script.play(played, range(2)), windows, strict=True):

@@ -101,8 +101,7 @@ def packaged() -> Bundle:
 
 
 def mixed(number: int) -> tuple[Sweep, Sweep]:
-    """A slide over foam, and a window whose taxels come from slides of their own: the spectra and
-    loads of foam without a pattern that passes."""
+    """A slide over foam, and its spectra and loads without a pattern that passes."""
     rng = np.random.default_rng(number)
     places = skin.placements("T-REAL", number)
     slides = [skin.window("foam", places[0], rng, skin.LEVEL_BLIND) for _ in range(16)]
@@ -127,8 +126,7 @@ def sure(made: Bundle) -> Manifest:
 
 
 def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
-    """The slide is named. Without the limit the mixed window has a label as well. An answer without
-    speeds (`slides`) is checked, too."""
+    """Without the limit it has a label; `slides` is checked, too."""
     assert packaged.manifest.sliding
     box = any_material(packaged, packaged.manifest.sliding.pattern)
     unlimited = any_material(packaged, None)
@@ -142,8 +140,7 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
 
 
 def test_an_early_answer_needs_a_pattern_too(packaged):
-    """Four tenths of a slide are answered early. Those of a mixed window are answered only without
-    the limit."""
+    """Of a slide four tenths are; of a mixed window only without the limit."""
     early, unlimited = (
         EarlyExit(any_material(replace(packaged, manifest=sure(packaged)), pattern))
         for pattern in (packaged.manifest.sliding.pattern, None)

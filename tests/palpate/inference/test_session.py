@@ -1,5 +1,4 @@
-"""The model runner: one session for outputs that are requested together, and no second session for
-the same outputs."""
+"""The model runner: one session for outputs that are requested together."""
 
 from __future__ import annotations
 
@@ -70,8 +69,7 @@ def test_early_heads_have_their_own_session(tmp_path, opened):
 
 
 def test_answers_are_the_same_with_early_heads_and_without(default_bundle):
-    """The logits of golden sweeps and noise are the same, bit for bit, from classifiers with and
-    without early answers, and from all outputs of the delivered model at once."""
+    """Golden sweeps and noise, bit for bit."""
     plain, early = (
         Classifier(default_bundle, VirtualClock()),
         Classifier(default_bundle, VirtualClock()),

@@ -142,8 +142,7 @@ def check_content(u: Backend, frames: Frames) -> None:
 
 
 def test_streams_without_a_gap(need):
-    """Every frame comes once and in order, its time later than that of the frame before and never
-    in the future. Then the skin is released."""
+    """Every frame once, in order, later than the last, never ahead; then the skin is released."""
     u = need("skin")
     with SensorReader(u) as reader:
         reader.seconds(SETTLE_S)
@@ -384,8 +383,7 @@ def test_start_and_stop(need):
 
 
 def test_one_line(need):
-    """A rise is START and a fall STOP, in one call or one by one; a line that is high at first
-    makes no START."""
+    """A rise is START and a fall STOP, in one call or several; high at first is no START."""
     u = need("lines")
     u.drive(u.trigger.start, True)
     with Watcher(u, mode="one-line") as watcher:

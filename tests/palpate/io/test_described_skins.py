@@ -61,8 +61,7 @@ def shortened(taxels: Taxels) -> bytes:
 
 
 class Registers(Polled):
-    """A Modbus device whose input registers from 100 on are the taxels, of one frame from the
-    first register on."""
+    """A Modbus device whose input registers from 100 on are the taxels of one frame."""
 
     _latched = b""
 

@@ -1,5 +1,4 @@
-"""Trigger and output lines on the simulated gpiod: edges, glitches, losses and storms of inputs;
-outputs in their order."""
+"""Trigger and output lines on the simulated gpiod: edges, glitches, losses, storms, outputs."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ def output_config(**changes: Any) -> OutputConfig:
 
 
 class TriggerSetup:
-    """A simulated gpiod, a trigger on it and their clock. Times count from `t0`; line `high` is
-    high from then on."""
+    """A trigger on a simulated gpiod; times count from `t0`, `high` is high from then on."""
 
     def __init__(
         self,
@@ -477,8 +475,7 @@ def test_a_chip_that_cannot_be_opened(number, why):
     "module", [SimpleNamespace(__version__="1.6.3", Chip=object), SimpleNamespace()]
 )
 def test_binding_of_libgpiod_1(module):
-    """The old binding, or another module of that name, is refused with its version; the installed
-    one and the double are accepted."""
+    """It is refused with its version; the installed one and the double are not."""
     version = getattr(module, "__version__", "of unknown version")
     with pytest.raises(LineError, match=version):
         GpioTrigger(trigger_config(), module)

@@ -1,5 +1,4 @@
-"""Sweeps without GPIO lines: commands, the space bar of a real pseudo-terminal, the clock; and the
-settings that each refuses."""
+"""Sweeps without GPIO lines: commands, the space bar of a real terminal, the clock."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Serial line and class bits: sentences that others can parse, a port that is never waited for,
-bits that settle first."""
+"""Serial line and class bits: sentences, a port that is never waited for, bits that settle."""
 
 import fcntl
 import io
@@ -130,8 +129,7 @@ def test_bad_commands_are_answered(line, hint):
 
 @pytest.mark.parametrize("line", [b"ID", b"help", b"$PPLP,MATERIAL", b"$PPLP,ID,now", b"\xff"])
 def test_the_example_of_an_error_can_be_copied(line):
-    """The command that an ANS error suggests is understood when it is sent, whatever was typed
-    before. No part of it is lost to NMEA's reserved characters."""
+    """It is understood when sent, whatever was typed, whole despite NMEA."""
     ((bad,), _) = parse(line + b"\r\n")
     heard = sentence("ANS", bad.name, "error", bad.error).decode("ascii")
     example = re.search(r"(?:send for example|send it as) ([^,*]+)", heard)[1]
@@ -245,8 +243,7 @@ def test_too_few_class_bits():
 
 
 def test_a_line_that_echoes_gets_no_answers():
-    """Sentences of the box come back, whole or in part: they are not commands, so that no answer
-    is answered. A command among them is carried out."""
+    """Own sentences, whole or in part, are no commands; one among them is."""
     own = [sentence(kind, 1, "ok") for kind in OWN]
     found, rest = parse(b"".join(own) + b"$PPLP,ID\r\n" + own[0][:7])
     assert [c.name for c in found] == ["ID"]
@@ -268,8 +265,7 @@ def test_a_line_that_echoes_gets_no_answers():
     ids=["lower case", "cut", "quoted", "damaged", "doubled"],
 )
 def test_an_echo_with_changes_is_not_answered_without_end(change):
-    """Each answer comes back changed, for a minute: eight answers, and then one a second. A command
-    in between is carried out, and a bad line after it is answered at once."""
+    """Eight answers, then one a second; commands still count."""
     clock = rig.VirtualClock()
     with pseudo_terminal.pair() as (robot, name):
         sink = sink_on(name, clock)

@@ -1,5 +1,4 @@
-"""PROTOCOL.md over a serial port: a real pseudo-terminal, the real pyserial; each failure has its
-state and message."""
+"""PROTOCOL.md over a real pseudo-terminal and pyserial: each failure has its state."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The bytes of each skin, put together by hand from published layouts: frames, and bytes that are
-not frames."""
+"""The bytes of each skin, put together by hand from published layouts, and other bytes."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def test_noise_leaves_what_may_begin_a_mark():
 
 @pytest.mark.parametrize("cut", [0, 3])
 def test_a_mark_among_the_numbers_of_some_frames(cut):
-    """The numbers of the first three frames hold a mark: frames begin at the mark that stays, also
-    where the stream begins at the other."""
+    """Frames begin at the mark that stays, also after the other."""
     numbers = ["01aa55040506"] * 3 + ["010203040506"] * 6
     data = b"".join(bytes.fromhex("aa55" + six) for six in numbers)[cut:]
     found = decoded(SMALL, data)
@@ -176,8 +174,7 @@ def test_the_value_that_does_not_fit_is_named(number, line, misfit):
 
 
 def test_only_lines_with_the_prefix_are_read():
-    """Most lines of a firmware may be something else: they are neither frames nor garbage, so no
-    frame counts as lost. A wanted line whose beginning is damaged is garbage."""
+    """Others are neither frames nor garbage; a damaged beginning is."""
     p = replace(TEXT, cols=4, prefix="P:")
     other, wanted = b"T: 21.5\nL,1,2,3,4\n\n" * 5, b"P:1,2,3,4\n"
     found = decoded(p, (other + wanted) * 4)
@@ -261,8 +258,7 @@ def test_papillarray_with_a_tail_inside():
 
 
 def test_a_packet_of_another_form_is_read_by_its_own_table():
-    """Among packets of one form, one with any byte changed and a right sum is decoded as alone;
-    so are packets of another number of sensors, and those after garbage."""
+    """Any changed byte with a right sum, and after garbage."""
     p = replace(profile("papillarray"), rows=2, cols=1)
     grid = np.arange(1, 13, dtype=np.float32).reshape(2, 1, 6)
     good = papillarray(grid, 70_000, sensors=2)
@@ -309,8 +305,7 @@ def test_xela_byte_by_byte():
 
 
 def test_other_nodes_on_the_bus_are_passed_over_and_counted():
-    """Data frames of other ids, extended, remote and FD frames between the taxels of a frame do not
-    break it, also where a read ends; a line that is not a CAN frame does."""
+    """Whatever they send; a line that is not CAN breaks."""
     p = replace(profile("xela-can"), rows=1, cols=2)
     own = [b"t7108001234567800FF00\r", b"t71180000010002000300\r"]
     others = b"t1232AABB\rT000007102AABB\rr7108\rR000007108\rt7204AABBCCDD\r"
@@ -442,8 +437,7 @@ def test_nothing_but_marks_is_passed_over(name, monkeypatch):
     ],
 )
 def test_numbers_of_every_width(number, order, wire, values):
-    """Both byte orders and signs. Above 16 bits they become float32, which rounds the lowest bits
-    of more than 24. A text has no width."""
+    """Both orders and signs; above 16 bits float32, which rounds; a text has no width."""
     if "4" in number:
         with pytest.raises(ConfigError, match=number):
             replace(TEXT, number=number)

@@ -79,8 +79,7 @@ def test_jitter(name):
     ],
 )
 def test_a_fault_has_its_state_and_ends(name, fault, before_s, states, why):
-    """Pulled, silent or held by another program, also from the start: no frame and never streaming
-    meanwhile; then a new epoch with the right frames."""
+    """Pulled, silent, held, also at first: no frame; then a new epoch."""
     skin = WiredSkin(name)
     first = skin.seconds(before_s) if before_s else None
     setattr(skin.port, fault, True)
@@ -260,8 +259,7 @@ def test_back_pressure(name):
 
 @each
 def test_commands(name):
-    """Only the profile's commands are written at start and end, and its requests in between; a
-    tare only if it is set."""
+    """Only the profile's, at start and end and as requests; a tare only if it is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.sensor.close()
@@ -285,8 +283,7 @@ def test_tare():
 
 @pytest.mark.parametrize("name", ["flexitac", "matrix", "anyskin"])
 def test_a_mark_in_the_payload(name):
-    """The mark occurs among the numbers, in every frame at the same place while the skin is at
-    rest: no frame is cut at the wrong place, and once the number changes frames come."""
+    """In every frame at rest: none is cut wrongly, and once it changes frames come."""
     skin = WiredSkin(name)
     mark = skin.profile.trailer + skin.profile.marker
     resting = bytearray(wire(name, 0))
@@ -350,8 +347,7 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path):
 
 @pytest.mark.parametrize("name", ["flexitac", "reskin"])
 def test_a_board_that_boots_whenever_it_is_opened(name):
-    """It sends nothing, or a boot message, for two seconds after each opening: the box waits longer
-    each time until frames come, and the message names the setting."""
+    """The box waits longer each time; the message names the setting."""
     skin = WiredSkin(name)
     opened_ns, open_port, read = 0, skin.port.open, skin.port.read
 

@@ -1,5 +1,4 @@
-"""The factory: the sensor for each profile, the format of its sweeps, and a real terminal with an
-emulated skin."""
+"""The factory: sensor and format for each profile, and a terminal with an emulated skin."""
 
 from __future__ import annotations
 

@@ -81,8 +81,7 @@ def test_a_wrong_file(tmp_path, text, hint):
 
 
 def test_names(tmp_path):
-    """A misspelt name, a name that leads out of the folder, an empty name. The first folder has
-    priority; palpate needs no file; a name with the ending .toml is a file."""
+    """Misspelt, out of the folder, empty; the first folder first; `palpate` needs no file."""
     folder = written(tmp_path, GOOD)
     with pytest.raises(ConfigError, match="oven"):
         load("oven", [folder])

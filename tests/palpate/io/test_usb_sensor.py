@@ -78,8 +78,7 @@ def check_content(frames: Frames, format: SweepFormat = FMT) -> None:
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm):
-    """A healthy board, vendor class or CDC-ACM: every frame, its time correct to 1 ms. cdc_acm has
-    the device at first; a board on a serial port gets DTR."""
+    """Every frame, to 1 ms; cdc_acm has the device at first; serial boards get DTR."""
     reading = SensorReading(acm=acm)
     assert reading.bus.kernel_driver is acm
     frames = reading.seconds(5)
@@ -420,8 +419,7 @@ def test_more_enumerations_than_a_number_holds():
 
 
 def test_a_count_that_begins_anew_for_ever_is_a_mismatch():
-    """Packets that restart the count again and again stop the stream. The number of an enumeration
-    never overflows, however often it is reached."""
+    """And the number of an enumeration never overflows."""
     reading = SensorReading()
     reading.seconds(0.5)
     starts = (1 << 31, 1 << 30, 0, 3 << 30) * 10

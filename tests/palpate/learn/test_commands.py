@@ -123,8 +123,7 @@ def test_a_box_without_lines_waits_to_be_taught(board, mode, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.thorough  # a fit with all checks of an export
 def test_recorded_sweeps_become_the_bundle_of_the_box(options, tmp_path, capsys):
-    """Signed by the box, on trial, with who has taught it; taught again, the version counts up.
-    Scratch files are gone, the sweeps are not."""
+    """Signed, on trial, by whom; again the version counts up."""
     install_scripts.enrolment_key(tmp_path / "enrolment")
     lessons.write(tmp_path / "store" / "sweeps", easy(8))
     code, text = said([*options, "--use", "--by", "anna"], capsys)

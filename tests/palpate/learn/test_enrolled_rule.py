@@ -1,5 +1,4 @@
-"""With enrolled labels the network decides among the trained ones, and the distances decide between
-these and the enrolled ones."""
+"""The network decides among trained labels, distances between these and enrolled ones."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ def distances(new: Bundle, least: float | None) -> ClassDistances:
 
 
 def test_the_network_divides_what_the_distances_leave(new):
-    """The enrolled label has its probability by distances; the others share the rest as the network
-    says, whatever the distances among them say."""
+    """The others share the rest as the network says."""
     rng, means = np.random.default_rng(0), distances(new, 0.6)
     z, network = rng.normal(3, 3, (20, 2)), rng.normal(0, 5, (20, 3))
     p = softmax(means.joined(network, z))
@@ -49,8 +47,7 @@ def test_the_network_divides_what_the_distances_leave(new):
 
 
 def test_without_enrolled_labels_the_network_answers_alone(tmp_path):
-    """Its logits are not changed in any bit; for displaced contacts they are divided by the
-    temperature of the rule."""
+    """Its logits keep their bits, or a rule's temperature."""
     classes = toy_bundle.load(tmp_path / "toy").classes
     assert classes
     network, z = np.float32([1, 2, 3.3]), np.float32([4, 5])
@@ -61,8 +58,7 @@ def test_without_enrolled_labels_the_network_answers_alone(tmp_path):
 
 
 def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path):
-    """The network and the means may call a sweep of an enrolled material different trained labels:
-    neither knows it. For trained golden sweeps this is a fault."""
+    """Neither knows them; for trained ones it is a fault."""
     arrays = toy_bundle.means(means=np.float32([[0, 0], [6, 0], [0, 6]]))
     old = toy_bundle.load(tmp_path / "toy", arrays=arrays)
     assert old.classes
@@ -118,8 +114,7 @@ def near_b(new: Bundle, p: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("fusion", "fused"), [("product", "felt"), ("none", ""), ("vote", "")])
 def test_sweeps_that_are_not_enough_are_enough_together(new, fusion, fused):
-    """The least probability holds for the product of the sweeps. Alone each gets a trained label,
-    without a trace of felt; with votes each is counted for that."""
+    """By the product; with votes each counts for its label."""
     z = near_b(new, 0.6)
     it = Classifier(new, VirtualClock(), fusion)
     verdicts = [it(toy_bundle.sweep(*z, number=n, object=1)) for n in (1, 2, 3)]
@@ -136,8 +131,7 @@ def test_sweeps_that_are_not_enough_are_enough_together(new, fusion, fused):
 
 
 def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path):
-    """Its distances are those of displaced sweeps, and network and distances are divided by its
-    temperature."""
+    """By displaced sweeps' distances and temperature."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     rules = {"displacement": toy_bundle.DISPLACEMENT, "contact": toy_bundle.IN_PLACE}
     old = toy_bundle.load(tmp_path / "toy", arrays=arrays, **rules)
@@ -159,8 +153,7 @@ def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path):
 
 
 def test_left_out_sweeps_are_answered_as_the_box_would(new, tmp_path):
-    """Each answer of the assessment is that of a bundle without the sweep. A sweep between b and
-    felt gets b, because felt does not have its least probability."""
+    """Between b and felt it is b: felt needs its probability."""
     old, near = toy_bundle.load(tmp_path / "old"), toy_bundle.window(*near_b(new, 0.55))
     sweeps = np.stack([*FELT, *FELT, near])
     many = {"felt": sweeps}

@@ -1,5 +1,4 @@
-"""Enrolment: a label is added by arithmetic, unsuitable sweeps give warnings, and the new bundle is
-complete or absent."""
+"""Enrolment: a label is added by arithmetic; the new bundle is complete or absent."""
 
 from __future__ import annotations
 
@@ -71,8 +70,7 @@ def test_a_label_for_a_skin_with_axes(tmp_path):
 
 
 def test_the_new_bundle_runs(old, tmp_path):
-    """Written and read again, the bundle equals the result of `enrol` and passes its self-test. It
-    gives the new label, the old labels, and unknown."""
+    """Read again it equals `enrol`'s, passes its self-test, and gives all labels."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
     toy_bundle.put(tmp_path / "new", enrolment.files(toy_bundle.files(), new, None))
     read = bundle.load(tmp_path / "new")
@@ -92,8 +90,7 @@ def test_the_new_bundle_runs(old, tmp_path):
 
 
 def test_a_material_that_scatters_is_kept(old):
-    """Its spread is computed from its sweeps and one assumed sweep at the trained distance: (2 + 4
-    * 9) / (2 * 4)."""
+    """Its sweeps and an assumed one: (2 + 4 * 9) / (2 * 4)."""
     new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
     assert new.bundle.classes is not None
     assert new.bundle.classes.spread[3] == pytest.approx(38 / 8, abs=1e-4)
@@ -134,8 +131,7 @@ def test_one_sweep_is_enough_and_labels_add_up(old):
 
 @pytest.mark.parametrize("n", [1, 2, 5, 10])
 def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n):
-    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or the
-    mean of n sweeps."""
+    """1 - exp(-limit / 2) of them."""
     rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, strict=4.0, balanced=4.0)
     kept = []
     for _ in range(100):
@@ -153,8 +149,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
 
 
 def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path):
-    """Its shape is 1. For displaced contacts its mean is turned and shifted like the means of the
-    trained labels."""
+    """1; turned and shifted when displaced."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     signed = toy_bundle.files(
         arrays=arrays, displacement=toy_bundle.DISPLACEMENT, contact=toy_bundle.IN_PLACE
@@ -198,8 +193,7 @@ def test_early_answers_end_with_an_enrolment(tmp_path):
     ],
 )
 def test_unsuitable_sweeps_are_told_with_numbers(old, at, hints):
-    """Sweeps that are like a trained material, or unlike each other, give a warning and are
-    enrolled."""
+    """Like a trained material, or unlike each other: a warning."""
     new = enrolment.enrol(old, "felt", counts(*at))
     found = [text for text in (new.disagreement, *new.warnings) if text]
     assert len(found) == len(hints), found
@@ -209,8 +203,7 @@ def test_unsuitable_sweeps_are_told_with_numbers(old, at, hints):
 
 
 def test_materials_that_lie_close_anyway_make_no_warning(tmp_path):
-    """Closer than the limit, but no closer than two trained materials are, which the bundle accepts
-    already."""
+    """No closer than two trained ones of the bundle."""
     arrays = toy_bundle.means(
         means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2])
     )
@@ -221,8 +214,7 @@ def test_materials_that_lie_close_anyway_make_no_warning(tmp_path):
 
 @pytest.mark.parametrize("label", ["b", "a,b", "", "x" * 25])
 def test_labels_that_cannot_be_enrolled(old, label):
-    """Labels that are used already, or not allowed in a sentence, are reported before the first
-    sweep."""
+    """Used already, or not allowed in a sentence: before the first sweep."""
     for refused in (enrolment.admit, lambda *it: enrolment.enrol(*it, counts((7, 8)))):
         with pytest.raises(BundleError, match=f"label '{label}"):
             refused(old, label)

@@ -74,8 +74,7 @@ def test_the_units_name_the_file(tmp_path, kind):
 
 
 def test_the_service_alone_can_write_the_file():
-    """Each unit with this folder runs as user palpate, and nobody else may write to the folder, its
-    group included."""
+    """Each unit with this folder runs as palpate; not its group."""
     units = [path.read_text() for path in (ROOT / "systemd").glob("*.service")]
     owners = [unit for unit in units if "\nRuntimeDirectory=palpate\n" in unit]
     assert len(owners) == 2

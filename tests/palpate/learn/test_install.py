@@ -73,8 +73,7 @@ def test_two_that_teach_at_once_share_no_folder(tmp_path):
 
 
 def test_a_full_disk_leaves_the_bundle_in_service(box, tmp_path, monkeypatch, capsys):
-    """Whichever write fails: the reason is a line for the page, all sweeps are there, the box runs
-    the bundle of before or the new one, whole, and with room it can be taught."""
+    """Whichever write fails: a line, all sweeps, a whole bundle."""
     sweeps, done, at = tmp_path / "store" / "sweeps", False, 0
     kept = sorted(path.read_bytes() for path in sweeps.iterdir())
     while not done:

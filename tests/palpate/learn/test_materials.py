@@ -102,8 +102,7 @@ def box(tmp_path: Path) -> TaughtDelivery:
 
 
 def test_a_new_material_joins_the_delivered_ones(box, capsys):
-    """It is signed by this box and on trial, without a fit; model and trained labels stay byte for
-    byte; the sweep that was not a slide is named and not learnt from."""
+    """Signed, on trial, without a fit; trained labels stay."""
     before = box.running
     code, learnt = box.teach(capsys)
     assert code == 0
@@ -122,8 +121,7 @@ def test_a_new_material_joins_the_delivered_ones(box, capsys):
 
 
 def test_more_sweeps_another_material_and_a_forgotten_one(box, capsys):
-    """Each USE learns all that is recorded anew; a material that `enrol` has added stays; one that
-    is forgotten leaves."""
+    """Each USE learns anew; enrolled ones stay."""
     box.teach(capsys, "--use")
     first = box.running.bundle
     record(box.store, "cork", slides(CORK, 2, first=10), 10)
@@ -139,8 +137,7 @@ def test_more_sweeps_another_material_and_a_forgotten_one(box, capsys):
 
 
 def test_a_material_keeps_its_name_for_people(box, capsys):
-    """From the sidecar into the bundle, and through every later USE, also without its sweeps; the
-    labels of the bundle are taken for whoever types a name later."""
+    """Through every later USE; labels of the bundle are taken."""
     for path in sorted((box.store / "sweeps").glob("*.json")):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"display": "木"}))
     assert box.teach(capsys, "--use")[0] == 0
@@ -157,8 +154,7 @@ def test_a_material_keeps_its_name_for_people(box, capsys):
 
 
 def test_a_delivery_during_use_is_not_replaced(box, capsys, monkeypatch):
-    """Another bundle comes into service while the sweeps are learnt: it stays, and the person who
-    teaches is told."""
+    """It stays, and the person who teaches is told."""
     taught = materials.taught
 
     def slowly(*given: Any, **more: Any) -> enrolment.Enrolment:
@@ -319,8 +315,7 @@ def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path):
 
 
 def test_a_trained_material_is_refused_before_a_sweep(box, capsys):
-    """In the terminal, and on the page or the serial line after a trial: more sweeps of it would
-    teach nothing here."""
+    """In the terminal, and by page or line after a trial."""
     words = [*box.words, "--label", "foam", "--sim", "skin", "--virtual"]
     recorded = sorted((box.store / "sweeps").iterdir())
     assert main(["teach", *words]) == ConfigError.exit_code

@@ -119,8 +119,7 @@ def test_faulty_sweeps_do_not_count(taught):
 
 
 def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught):
-    """At once if the check finds it; later if the process does, by comparing all sweeps. Each is
-    said once; files stay."""
+    """At once or by the process; each once; files stay."""
     taught.assess = printed(
         ASSESSED
         | {"no_slides": [{"number": 2, "text": "sweep 2 of cork is not learnt from: rest"}]}
@@ -174,8 +173,7 @@ def test_use_makes_a_bundle_and_says_so(taught):
     ],
 )
 def test_a_failed_process_is_said_and_changes_nothing(taught, learn, why):
-    """Whatever becomes of the process: the reason is shown, all sweeps stay, and the next attempt
-    is possible."""
+    """The reason is shown, and the next attempt is possible."""
     taught.sweeps("cork", 2)
     taught.sweeps("pine", 2)
     taught.learn = learn
@@ -214,8 +212,7 @@ class HandClock(SystemClock):
     ("quiet_s", "why"), [(1e6, "not done within 300 s"), (200.0, "no further for 200 s")]
 )
 def test_a_process_that_hangs_is_killed(quiet_s, why):
-    """It spins as a library does that gets no memory. After its limit, or after a time without a
-    line, it ends with a reason, together with the processes that it started."""
+    """With a reason and its children: after its limit or without a line."""
     code = (
         "import subprocess, sys, time\n"
         "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
@@ -255,8 +252,7 @@ def test_a_label_that_cannot_be_sent_is_refused(taught, label):
 
 
 def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
-    """Two bits name three materials: the fourth is refused by TEACH, before a sweep of it is made.
-    Recorded by a box with more bits, it is said at the next start, until one is forgotten."""
+    """By TEACH; or at the start, until one is forgotten."""
     narrow = Taught(tmp_path, codes=4)
     for material in ("cork", "pine", "felt"):
         narrow.sweeps(material, 1)
@@ -388,8 +384,7 @@ def test_a_box_without_the_extra_says_what_to_install(monkeypatch):
 
 
 def test_a_mislabelled_sweep_is_moved_and_the_sweeps_are_assessed_again(taught):
-    """Its suspicion goes at once; materials without a sweep are renamed, too; while a bundle is
-    made, sweeps stay."""
+    """Not while a bundle is made."""
     suspect = {"sweep": "sweep-000002", "material": "cork", "looks_like": "pine"}
     other = suspect | {"sweep": "sweep-000001"}
     taught.assess = printed(ASSESSED | {"suspects": [other, suspect]})

@@ -1,5 +1,4 @@
-"""A skin with three axes through the whole box: the wire, windows, answers, recordings, captures
-and their replay."""
+"""A skin with three axes through the whole box: wire, windows, answers, files, replay."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ def act(z1: float, z2: float, label: str) -> rig.Act:
 
 
 def test_answers_are_those_of_the_replay(rigged, tmp_path, capsys):
-    """Labels are right. Kept sweeps have all axes and replay bit for bit. The capture gives the
-    same sentences."""
+    """Labels are right; kept sweeps and capture replay bit for bit."""
     model = toy_bundle.load(tmp_path / "bundle", format=FMT)
     stuck = act(0, 0, "stuck")
     stuck.frames[OFF:-OFF, 1, 0, 0] = 5

@@ -1,5 +1,4 @@
-"""A model, an observer or a command that fails: each sweep is answered, and the program ends only
-where a new start may help."""
+"""A model, an observer or a command that fails: each sweep is answered."""
 
 from __future__ import annotations
 
@@ -188,8 +187,7 @@ def test_a_command_that_fails_is_answered(rigged, monkeypatch):
     ("why", "code"), [("std::bad_alloc", 70), ("Failed to allocate memory", 70), ("no op X", 78)]
 )
 def test_memory_that_is_short_is_no_fault_of_the_bundle(monkeypatch, why, code):
-    """std::bad_alloc while a model is opened or run has an exit code that is restarted; a model
-    that onnxruntime refuses has not."""
+    """std::bad_alloc is restarted; a refused model is not."""
 
     def refuse(*given: object, **more: object) -> None:
         raise RuntimeError(why)

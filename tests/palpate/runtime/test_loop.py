@@ -1,5 +1,4 @@
-"""The whole box on simulated devices: USB bytes and GPIO edges in, sentences and lines out, and
-each way to fail."""
+"""The whole box on simulated devices: bytes and edges in, sentences and lines out."""
 
 from __future__ import annotations
 
@@ -57,8 +56,7 @@ def quiet(level: tuple[int, int] = (0, 1)) -> devices.SimDevices:
 
 
 def test_sweeps_become_sentences(rigged):
-    """Five sweeps: each answered once, with a right checksum, nothing lost, at the far end of the
-    serial line. The window equals the middle of the act that the robot played, to one frame."""
+    """Five sweeps: each once, nothing lost; the window is the middle of the act."""
     simulated = tubes(1000, 5)
     box = rigged(simulated)
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
@@ -76,8 +74,7 @@ def test_sweeps_become_sentences(rigged):
 
 
 def test_lines_follow_the_sweep(rigged):
-    """READY falls and BUSY rises with the sweep. Class bits are set before RESULT VALID, and both
-    fall when the next sweep starts."""
+    """READY and BUSY; class bits before RESULT VALID; both fall at the next."""
     simulated = tubes(1002, 2)
     box = rigged(simulated)
     box.until(lambda: simulated.finished(box.box.answered))
@@ -104,8 +101,7 @@ def test_dead_process_is_not_ready(default_bundle):
 
 
 def test_unplugged_during_a_sweep(rigged):
-    """The sweep is answered `sensor-lost` at once, and FAULT rises. A trigger meanwhile is
-    `not-ready`. After replugging the box works again."""
+    """`sensor-lost` at once and FAULT; then `not-ready`; replugged it works."""
     simulated = tubes(1003, 3)
     box = rigged(simulated)
     box.until(lambda: box.box.answered == 1)
@@ -124,8 +120,7 @@ def test_unplugged_during_a_sweep(rigged):
 
 
 def test_a_board_that_sends_no_frame_is_never_ready(rigged, logged):
-    """The board answers and sends nothing: READY stays low and FAULT high, a trigger is
-    `not-ready`, and READY rises with the first frame, like the log says."""
+    """FAULT and `not-ready`, until the first frame."""
     simulated = quiet()
     board = simulated.backend.board
     take, board.take = board.take, lambda: (take(), b"")[1]
@@ -162,8 +157,7 @@ def test_triggers_out_of_order(rigged, edges, want):
 
 
 def test_storm_of_edges(rigged):
-    """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is
-    fine."""
+    """10,000 in a second: `edges-lost`, no frame lost, and the next sweep is fine."""
     box = rigged(touched(slide(), quiet_s=6.5))
     box.seconds(0.5)
     for i in range(10_000):
@@ -181,8 +175,7 @@ def test_storm_of_edges(rigged):
 
 @pytest.mark.parametrize(("at", "count", "place"), [((1, 2), 77, "2.3"), ((2, 1), 0, "3.2")])
 def test_a_broken_taxel_is_bridged_and_named_everywhere(rigged, at, count, place):
-    """The answer is ok with the taxel in its detail. READY stays; after some seconds of the same
-    slide STA and the state have the taxel, too."""
+    """READY stays; after seconds STA and state have it."""
     frames = slide("plastic rough")
     frames[:, *at] = count
     box = rigged(touched(frames))
@@ -198,8 +191,7 @@ def test_a_broken_taxel_is_bridged_and_named_everywhere(rigged, at, count, place
 
 
 def test_commands(rigged, default_bundle):
-    """Identity, state, self-test, tare, new object and abort are answered. The answer to a wrong
-    command shows the right command."""
+    """Each is answered; the answer to a wrong command shows the right one."""
     box, labels = rigged(quiet()), default_bundle.manifest.labels
     box.seconds(1)
     commands = {
@@ -261,8 +253,7 @@ def test_state_is_sent_once_a_second(rigged):
 
 @pytest.mark.slow
 def test_a_robot_that_does_not_read_costs_no_frame(rigged):
-    """The serial line is full: sentences are dropped and counted, and no frame or sweep is
-    lost."""
+    """Sentences are dropped and counted, no sweep is lost."""
     simulated = tubes(1006, 20)
     box = rigged(simulated, sets=("serial.queue=4", "serial.state_s=0.05"))
     while not simulated.finished(box.box.answered):
@@ -272,8 +263,7 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged):
 
 
 def test_trouble_is_logged_once(rigged, logged):
-    """Trouble is logged when it begins and when it ends, not at every turn. The log has the open
-    port once."""
+    """When it begins and when it ends; the log has the open port once."""
     simulated = quiet()
     box = rigged(simulated)
     box.seconds(1)
@@ -318,8 +308,7 @@ class EffectLog(Observer):
 
 
 def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged):
-    """Two answers in one turn reach the port and each observer before any sweep is passed on;
-    health comes last."""
+    """Health comes last."""
     effects: list[str] = []
     box = rigged(quiet(), observers=[EffectLog("a", effects), EffectLog("b", effects), Observer()])
     box.seconds(0.5)

@@ -1,5 +1,4 @@
-"""Kept sweeps classified again: the same verdict bit for bit, and each way in which it can
-differ."""
+"""Kept sweeps classified again: the same verdict bit for bit, and each difference."""
 
 from __future__ import annotations
 
@@ -124,8 +123,7 @@ def kept_toy(path: Path, sweep: Sweep | None = None, **about: object) -> Path:
 
 @pytest.mark.slow
 def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle):
-    """With any present settings, fused and early answers give the sentences that were sent,
-    including times."""
+    """Fused and early answers, with any present settings."""
     folder, heard = in_service
     abouts = [sidecar(path) for path in sorted(folder.glob("*.npy"))]
     assert max(about["verdict"]["fused"] for about in abouts) == PER_OBJECT
@@ -139,8 +137,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle):
 
 @pytest.mark.slow
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle):
-    """A single file is fused with the earlier sweeps of its object alone. A sweep of another bundle
-    in another object would end their replay."""
+    """Another object's sweep of another bundle is no matter."""
     folder, heard = in_service
     change(at(folder, 2), bundle="0badcafe")
     for n in (1, 11, 30):
@@ -150,8 +147,7 @@ def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundl
 
 @pytest.mark.slow
 def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, default_bundle):
-    """The black box has removed an object's first or second sweep: the scores of the others are
-    compared by themselves, and the output says so."""
+    """And the output says so."""
     folder, _ = in_service
     fused = {n: sidecar(at(folder, n))["verdict"]["fused"] for n in range(1, SWEEPS + 1)}
     one, two, *_ = (n for n, count in fused.items() if count == PER_OBJECT)
@@ -169,8 +165,7 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, d
 
 
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path):
-    """Without the earlier sweeps the answer would not be early: the scores are compared, and no
-    sentence is written."""
+    """Without them: scores are compared, no sentence."""
     model = early_toy(tmp_path / "bundle")
     classifier = Classifier(model, rig.VirtualClock(), min_probability=0.97)
     whole = toy_bundle.sweep(2.5, 0.5, object=1)
@@ -220,8 +215,7 @@ def test_objects_end_in_a_replay_as_they_did(tmp_path, toy, conflict):
 
 
 def test_every_difference_is_told(in_service, default_bundle):
-    """For a score one bit off, another label or another tare the output has the difference, and the
-    exit code is 1."""
+    """A score one bit off, another label or tare: exit code 1."""
     folder, _ = in_service
     one_bit_off(at(folder, 1), "scores")
     change(at(folder, 2), verdict=sidecar(at(folder, 2))["verdict"] | {"label": "velvet"})
@@ -234,8 +228,7 @@ def test_every_difference_is_told(in_service, default_bundle):
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle):
-    """At any position in the file. The lowest bit of a raw count may change no score, but it
-    changes the checksum."""
+    """Anywhere: what changes no score changes the checksum."""
     folder, _ = in_service
     path = at(folder, 3)
     data = path.read_bytes()
@@ -252,8 +245,7 @@ def test_a_changed_byte_is_told(in_service, default_bundle):
 
 
 def test_another_bundle_is_named(in_service, default_bundle):
-    """For one sweep the error has both ids and says what to try. In a folder the sweeps of the
-    bundle are classified, and the others are listed."""
+    """Both ids for one sweep; in a folder the others are listed."""
     folder, _ = in_service
     other = replace(default_bundle, id="0badcafe")
     with pytest.raises(FormatError, match=f"{default_bundle.id}.*0badcafe"):
@@ -268,8 +260,7 @@ def test_another_bundle_is_named(in_service, default_bundle):
 
 
 def test_the_next_run_begins_anew(tmp_path, toy):
-    """Objects are counted anew in each run: object 1 of a later run in the same folder is not fused
-    with object 1 of an earlier run."""
+    """Object 1 of a later run is not fused with that of an earlier one."""
     for n, run in ((1, 0), (2, 1)):
         save(at(tmp_path, n), toy_bundle.sweep(0, 0, object=1), toy_bundle.FORMAT, {"run": run})
     _, sentences, outcomes = played(tmp_path, toy)
@@ -290,8 +281,7 @@ def test_a_sweep_that_is_not_answered_early_any_more(tmp_path):
 
 
 def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path, toy):
-    """The box would do it, too. A recording with a tare is classified with its own tare. The
-    verdict on a sweep without a window is its status."""
+    """Else by its own; no window: its status."""
     high = replace(toy, manifest=replace(toy.manifest, unloaded=(1e4,) * 4))
     bare = kept_toy(tmp_path)
     assert ",ok,a," in played(bare, toy)[1][0]

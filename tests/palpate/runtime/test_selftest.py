@@ -20,8 +20,7 @@ from tests.factories.skins import sweeps
 
 
 def results_of(model: bundle.Bundle, share: float = 0.01) -> dict[str, selftest.CheckResult]:
-    """The checks by component, of the simulated skin on a board where reading takes the share
-    `share` of a core."""
+    """The checks by component, of a simulated skin whose reading takes `share` of a core."""
     acts, source, format = script.named("skin", None, 1, spread=False)
     built = devices.build(format, acts, rig.VirtualClock(), source)
     wired = built.wire(config.load(None))
@@ -58,8 +57,7 @@ def test_what_reading_takes_of_a_core(default_bundle, share, ok):
     ],
 )
 def test_check_says_what_the_bundle_allows(default_bundle, component, changes, part):
-    """Speeds that can be measured and those of training, broken taxels that are bridged, and
-    disturbances. A bundle without these figures still passes."""
+    """Speeds, bridged taxels, disturbances; without them it passes."""
     changed = replace(default_bundle, manifest=replace(default_bundle.manifest, **changes))
     found = results_of(changed)[component]
     assert found.ok

@@ -1,5 +1,4 @@
-"""A box with a skin that does not count its frames: it says so in each sentence, in the status and
-beside each sweep."""
+"""A skin that does not count its frames: each sentence, status and sidecar says so."""
 
 from __future__ import annotations
 
@@ -55,8 +54,7 @@ class Circumstances(Observer):
 
 
 def test_it_is_said_everywhere(rigged, monkeypatch):
-    """RES has a 14th field, STA an 18th, and the status and the sidecar have a word. Frames are
-    used as usual."""
+    """Field 14 of RES, 18 of STA, words; frames are used as usual."""
     observer = Circumstances()
     box, _ = on_a_matrix(rigged, monkeypatch, observers=[observer])
     fields = swept(box).rpartition("*")[0].split(",")[2:]
@@ -83,8 +81,7 @@ def test_a_board_that_counts_says_nothing_of_it(rigged):
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.4])
 def test_a_capture_of_such_a_skin(rigged, monkeypatch, tmp_path, pause_s):
-    """The capture holds the profile, so that its bytes give the same frames, numbers and times
-    again."""
+    """It holds the profile, so its bytes give the same frames again."""
     path = tmp_path / "capture"
     capture = CaptureWriter(path, skin.FORMAT, PROFILE)
     box, wired = on_a_matrix(rigged, monkeypatch, capture)

@@ -83,8 +83,7 @@ def asking(offered: Offered, request: str = '{"sweeps": true}') -> FeedPeer:
 
 
 def test_hello_health_and_states(offered):
-    """hello, then health as in the status file, once a second for all readers, and a state with
-    each change."""
+    """Health as in the status file once a second, a state with each change."""
     peer = offered.peer()
     hello, health = peer.lines()
     about = {"type": "hello", "schema": 1, "pid": os.getpid(), "source": "usb", "skin": "palpate"}
@@ -107,8 +106,7 @@ def test_hello_health_and_states(offered):
 
 
 def test_a_verdict_has_the_probabilities_of_all_labels(offered):
-    """All fields of the verdict, with the shift of the contact; absent speed and force are left
-    out."""
+    """And the shift; absent speed and force are left out."""
     peer = asking(offered)
     for one in (OK, replace(OK, force_n=1.5)):
         offered.feed.answered(one)
@@ -122,8 +120,7 @@ def test_a_verdict_has_the_probabilities_of_all_labels(offered):
 
 @pytest.mark.parametrize("hz", [0.5, 1, 5, 8, 20])
 def test_frames_come_at_the_rate_that_was_asked_for(offered, hz):
-    """In ten seconds at 125 turns a second: the newest frame so often, and none once 0 was asked
-    for."""
+    """The newest so often, and none once 0 was asked for."""
     peer, other = offered.peer(), offered.peer()
     peer.ask(json.dumps({"frames": hz}))
     found: Lines = []
@@ -144,8 +141,7 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered, hz):
 
 
 def test_of_a_large_skin_fewer_frames_are_offered(offers):
-    """Text of 10,000 counts a second at most: 32x32 taxels at 9.8 frames a second, whatever was
-    asked for."""
+    """10,000 counts a second at most, whatever was asked."""
     format = SweepFormat(32, 32, 100.0, 200, "uint16")
     offered = offers(format)
     peer = offered.peer()
@@ -181,8 +177,7 @@ def test_a_clock_that_jumps_ahead_gives_one_line(offered):
 
 
 def test_a_verdict_is_not_kept_for_the_next_look(offered):
-    """It is there with the turn that has it, 8 ms after the last look; a storm of them is sent each
-    5 ms at most."""
+    """Sent with its turn; a storm each 5 ms at most."""
     peer = asking(offered)
 
     def later(ns: int) -> list[str]:
@@ -200,8 +195,7 @@ def test_a_verdict_is_not_kept_for_the_next_look(offered):
 
 @pytest.mark.parametrize("format", [skin.FORMAT, LARGE])
 def test_the_window_of_a_sweep_comes_bit_for_bit(offers, format):
-    """After the verdict, for those who asked; over 64 kB in pieces as the readers accept them, with
-    other lines in their order. A sweep without a window gives no line."""
+    """After the verdict, on request, in pieces over 64 kB."""
     offered = offers(format)
     peers, other = [asking(offered), asking(offered)], offered.peer()
     sweep = cut(format)
@@ -225,8 +219,7 @@ def test_the_window_of_a_sweep_comes_bit_for_bit(offers, format):
 
 
 def test_readers_that_never_read_cost_little_memory(offers):
-    """All but one, which asked for everything, and a sweep a second: the box needs less than 4 MiB
-    more, and goes on serving the last."""
+    """Less than 4 MiB, and the last is served."""
     large = offers(LARGE)
     every = '{"frames": 20, "sweeps": true}'
     peers = [asking(large, every) for _ in range(MOST_READERS - 1)]
@@ -250,8 +243,7 @@ def test_readers_that_never_read_cost_little_memory(offers):
 
 
 def test_a_window_that_is_too_large_is_counted(offers):
-    """Over 768 kB: the reader gets a `lost` line for one line. One of 640 kB comes behind other
-    lines."""
+    """Over 768 kB one `lost` line; 640 kB comes behind others."""
     format = SweepFormat(32, 32, 100.0, 300, "uint16")
     offered = offers(format)
     peer = asking(offered)
@@ -296,8 +288,7 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered):
 
 
 def test_a_window_takes_no_room_from_what_waits_already(offered):
-    """A reader that reads nothing: of thirty windows some fit, and of all lines each is there or
-    counted."""
+    """Of thirty some fit; each line is there or counted."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     offered.turns(2)
@@ -317,8 +308,7 @@ def test_a_window_takes_no_room_from_what_waits_already(offered):
 
 
 def test_one_reader_too_many_is_told_why_it_is_not_served(offered):
-    """It gets one line and its end; when another leaves there is room again. A verdict reaches all
-    readers in one round."""
+    """One line and its end; later there is room."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
     assert all(kinds(peer.lines())[0] == "hello" for peer in peers)
     late = offered.peer()
@@ -333,8 +323,7 @@ def test_one_reader_too_many_is_told_why_it_is_not_served(offered):
 
 
 def test_a_thousand_connections_leave_no_file_open(offered):
-    """Some read nothing, some go at once, some send half a request: no descriptor and no reader is
-    left of them."""
+    """Whatever they do, no descriptor and no reader is left."""
     before = len(os.listdir("/proc/self/fd"))
     for i in range(1000):
         peer = FeedPeer(offered.path)
@@ -398,8 +387,7 @@ def test_requests_in_parts_are_requests(offered):
 
 
 def test_endless_requests_are_read_a_little_each_turn(offered, monkeypatch):
-    """Only a few bytes of a reader that sends without a pause are read in a turn, and others are
-    served."""
+    """A few bytes a turn, and others are served."""
     taken: list[int] = []
     plain = feed_reader.requests
 
@@ -433,8 +421,7 @@ def test_endless_requests_are_read_a_little_each_turn(offered, monkeypatch):
     ],
 )
 def test_a_costly_look_at_the_sockets_puts_off_the_next(offered, monkeypatch, cost_ns, period_ns):
-    """Rounds use no more than SHARE of a core: a round of three times that length is followed by a
-    pause three times as long."""
+    """Rounds use no more than SHARE of a core."""
     offered.cost_ns = cost_ns
     looks: list[int] = []
     monkeypatch.setattr(offered.feed, "_work", lambda *_: looks.append(offered.clock.now_ns()))
@@ -444,8 +431,7 @@ def test_a_costly_look_at_the_sockets_puts_off_the_next(offered, monkeypatch, co
 
 
 def test_one_that_only_listens_may_close_its_own_side(offered):
-    """As `socat` does when its input ends: its last request stays valid, and lines go on; when it
-    leaves, it is closed."""
+    """As `socat` does: lines go on until it leaves."""
     peer = offered.peer()
     peer.ask('{"sweeps": true}')
     peer.socket.shutdown(socket.SHUT_WR)
@@ -474,8 +460,7 @@ def test_members_of_the_group_may_read_and_nobody_else(offers, mask):
 
 
 def test_the_socket_of_a_process_that_died_is_replaced(tmp_path, offers, logged):
-    """A killed box's socket refuses connections. A second box beside a living one logs it once, and
-    offers its feed when the first has ended."""
+    """A second box beside a living one waits for it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
         dead.bind(str(tmp_path / "feed.sock"))
     first = offers()
@@ -492,8 +477,7 @@ def test_the_socket_of_a_process_that_died_is_replaced(tmp_path, offers, logged)
 
 
 def test_a_path_that_cannot_be_bound_is_told_once(tmp_path, offers, logged):
-    """A missing folder, a file at the path, a path that is too long: one log line each, and turns
-    go on. Once the reason is gone the feed is there."""
+    """One line, turns go on; later the feed is there."""
     offered = offers(path=tmp_path / "run" / "feed.sock")
     offered.turns(2000)
     assert len(logged) == 1
@@ -510,8 +494,7 @@ def test_a_path_that_cannot_be_bound_is_told_once(tmp_path, offers, logged):
 
 
 def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered):
-    """Readers get the waiting lines, the reason, and an end. The later verdict of an open sweep is
-    not an error."""
+    """Waiting lines, the reason, an end."""
     peer = offered.peer()
     offered.feed.answered(OK)
     offered.feed.stopping()
@@ -536,8 +519,7 @@ def test_without_readers_nothing_is_written_as_text(offered, monkeypatch):
 
 
 def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged, tmp_path):
-    """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box
-    has cut."""
+    """On simulated devices, as the robot and the box."""
     simulated = tubes(1)
     path = tmp_path / "feed.sock"
     feed = FeedServer(path, skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0)

@@ -1,5 +1,4 @@
-"""The reason of a failed end: noted for `palpate status`, counted for the pause, removed after an
-end in order."""
+"""The reason of a failed end: noted, counted for the pause, removed after an order."""
 
 from __future__ import annotations
 
@@ -43,8 +42,7 @@ def test_status_says_which_end_a_person_must_mend(tmp_path):
 
 
 def test_the_pause_grows_and_begins_anew(tmp_path):
-    """Failures in a row lengthen it up to a limit; a run of a minute makes it short again, and an
-    end in order leaves nothing."""
+    """Up to a limit; short after a minute's run or an order."""
     clock = VirtualClock()
     pauses = []
     for _ in range(len(PAUSES_S) + 2):

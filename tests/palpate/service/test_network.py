@@ -22,8 +22,7 @@ def open_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("open_loopback")
 def test_two_boxes_of_one_name(monkeypatch):
-    """Each is found at its own address, with all that is open; the name alone would lead to the
-    other box."""
+    """Each is found at its own address, with all that is open."""
     ends = []
     for own, host in zip(("aaaaaa", "bbbbbb"), LOOPBACK, strict=True):
         monkeypatch.setattr(network, "box_id", lambda own=own: own)

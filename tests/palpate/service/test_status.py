@@ -1,5 +1,4 @@
-"""The service as a person sees it: the status file and its reader, and the log lines of
-verdicts."""
+"""The service as a person sees it: the status file, its reader, and log lines."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ def status_file(tmp_path: Path) -> ClockedStatus:
 
 
 def test_it_is_written_once_a_second_and_soon_after_news(status_file):
-    """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a
-    second later."""
+    """A verdict or lost skin within a tenth."""
     assert status_file.turns(4) in (4, 5)
     status_file.file.turn(HEALTH)
     status_file.file.answered(OK)
@@ -91,8 +89,7 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file):
 
 
 def test_every_user_may_read_it_whole(status_file):
-    """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still
-    has it whole."""
+    """Mode 644 under any umask; whole for whoever had it open."""
     before = os.umask(0o027)
     try:
         status_file.turns(0.01)
@@ -106,8 +103,7 @@ def test_every_user_may_read_it_whole(status_file):
 
 
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path):
-    """Since when, skin, bundle, further facts, the last verdicts newest first; advice where
-    something is wrong."""
+    """Newest verdict first; advice where something is wrong."""
     more = {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
     status_file = ClockedStatus(tmp_path, more=lambda: more)
     moved = "moved 2.1 mm too far towards row 4"
@@ -146,8 +142,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path):
 
 
 def test_a_program_that_has_ended_is_not_running(status_file):
-    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: `why` has the
-    reason. All exit with 1."""
+    """No file, or `why` has the reason; exit code 1."""
     assert status.exit_code(status_file.read()) == 1
     assert "does not run" in status_file.text()
     status_file.turns(0.01)
@@ -181,8 +176,7 @@ def test_a_file_of_another_form_is_named(status_file, text):
 
 
 def test_trouble_with_the_file_is_logged_once(tmp_path, logged):
-    """Without its folder the box goes on; one line, and another only after it had worked in
-    between."""
+    """One line, another only after it had worked."""
     status_file = ClockedStatus(tmp_path / "run")
     status_file.turns(5)
     assert len(logged) == 1
@@ -266,8 +260,7 @@ def asleep(box: Rigged) -> None:
     ],
 )
 def test_what_is_counted_is_shown(rigged, tmp_path, name, field, fault, text):
-    """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was
-    not before it."""
+    """In STA, STATE, file and words, and not before it."""
     simulated = idle_devices(60)
     file = StatusFile(tmp_path / "status.json", simulated.clock)
     sets = ("trigger.storm_edges=50",) if name == "storms" else ()

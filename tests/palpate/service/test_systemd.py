@@ -1,5 +1,4 @@
-"""The box as a service of systemd: the messages to the service manager and their times, and the log
-lines of verdicts."""
+"""The box as a service of systemd: the messages to the service manager and their times."""
 
 from __future__ import annotations
 
@@ -70,8 +69,7 @@ def state(streams: bool, text: str) -> Any:
 
 
 def test_only_what_is_new_is_sent(socket_end):
-    """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the
-    end."""
+    """STATUS at changes, READY once, STOPPING at the end."""
     sender, _ = notifier(socket_end)
     for ready, text in ((False, "absent"), (True, "fine"), (False, "no"), (True, "no")):
         sender.turn(state(ready, text))
@@ -82,8 +80,7 @@ def test_only_what_is_new_is_sent(socket_end):
 
 
 def test_the_watchdog_is_fed_by_turns_alone(socket_end):
-    """At the first turn, then at most each second of its ten; a box that takes no turn is
-    silent."""
+    """At most each second of its ten; silent without turns."""
     sender, clock = notifier(socket_end, **WATCHDOG, WATCHDOG_PID=str(os.getpid()))
     sender.turn(state(True, "fine"))
     assert socket_end.heard() == [["STATUS=fine", "READY=1", "WATCHDOG=1"]]
@@ -98,8 +95,7 @@ def test_the_watchdog_is_fed_by_turns_alone(socket_end):
 
 
 def test_turns_without_a_skin_keep_the_start_alive(socket_end):
-    """Until READY each feeding moves the end of the start on, by the watchdog's time; none after
-    it."""
+    """Until READY each feeding moves its end on."""
     sender, clock = notifier(socket_end, **WATCHDOG)
     for ready in (False, False, True, True):
         sender.turn(state(ready, ""))
@@ -109,16 +105,14 @@ def test_turns_without_a_skin_keep_the_start_alive(socket_end):
 
 
 def test_text_of_a_device_is_no_message(socket_end):
-    """A line break in a status would begin another message. Bytes that are not text are sent,
-    too."""
+    """Line breaks begin none; bytes that are not text are sent."""
     sender, _ = notifier(socket_end)
     sender.turn(state(False, "skin absent: no\nREADY=1\r\nMAINPID=1 \udcff"))
     assert socket_end.heard() == [["STATUS=skin absent: no READY=1 MAINPID=1 ?"]]
 
 
 def test_a_socket_that_is_gone_costs_nothing(socket_end, tmp_path):
-    """Without a listener, or with a full socket, the box goes on; unsent messages are sent
-    later."""
+    """The box goes on; unsent messages are sent later."""
     sender, _ = notifier(socket_end)
     socket_end.socket.close()
     Path(socket_end.address).unlink(missing_ok=True)
@@ -149,8 +143,7 @@ TEXTS = ["10s", "-5", "1e6", "\u0663", "9" * 5000, "0x10", " "]
     ],
 )
 def test_no_watchdog_or_another_s_is_not_fed(socket_end, more, told, logged):
-    """WATCHDOG_USEC unset or WATCHDOG_PID not ours; if it is no number, a line of the log says
-    so."""
+    """Unset or not ours; a line for what is no number."""
     sender, clock = notifier(socket_end, **more)
     for _ in range(3):
         sender.turn(state(True, "fine"))
@@ -178,8 +171,7 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged):
-    """Without a skin the status has the missing part; then it streams, and counts the answered
-    sweeps."""
+    """Until then the status has what is missing."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
     box = rigged(simulated, observers=[turn_log])
@@ -200,8 +192,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged):
 
 
 def test_a_turn_ends_after_everything_in_it(rigged):
-    """One call for each whole turn: none for the turn that hangs after its sentence, at the
-    disk."""
+    """None for the turn that hangs at the disk."""
     turn_log = TurnLog()
 
     def hang(sweep: object, verdict: object) -> None:
@@ -231,8 +222,7 @@ def test_stopping_is_sent_before_the_last_answer(rigged):
 
 @pytest.mark.slow
 def test_the_command_notifies_systemd(tmp_path):
-    """`palpate run` under systemd: first a status, READY once, the watchdog fed while it runs,
-    STOPPING on SIGTERM."""
+    """`palpate run`: status, READY, watchdog, STOPPING on SIGTERM."""
     socket_end = ManagerSocket(str(tmp_path / "notify"))
     socket_end.socket.settimeout(30)
     env = os.environ | {"NOTIFY_SOCKET": socket_end.address, "WATCHDOG_USEC": "100000"}

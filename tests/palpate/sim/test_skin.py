@@ -1,5 +1,4 @@
-"""The simulated finger and skin (`palpate.sim.skin`): shapes, the result of each effect alone,
-and the sets."""
+"""The simulated finger and skin: shapes, the result of each effect alone, and the sets."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ SHEAR = World(shear=True)
 
 
 def test_the_normal_axis_of_a_skin_with_shear_is_that_without():
-    """With the same finger and random numbers, the pressure differs only by the noise of the
-    readout; shear only adds axes."""
+    """But for the noise of the readout."""
     off = frozenset({"noise"})
     plain, three = (
         skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True)
@@ -50,8 +48,7 @@ def test_the_normal_axis_of_a_skin_with_shear_is_that_without():
 
 
 def test_friction_pulls_against_the_motion_while_the_finger_slides():
-    """Without relief the shear along the rows is 0.4 of the pressure and negative; before and after
-    the slide it is 0."""
+    """0.4 of the pressure; else 0."""
     frames = skin.sweep("metal", PLACE, rng(), replace(only("position"), shear=True)).astype(float)
     along, normal = frames[..., 0], frames[..., 2]
     slides = slice(225, 225 + 2250)
@@ -138,8 +135,7 @@ def test_a_switch_reaches_its_own_effect_only(effect, call):
 
 @pytest.mark.parametrize("effect", ["drift", "spot", "texture", "vibration"])
 def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect):
-    """The readout noise, as the difference with and without it, is the same with and without
-    another effect."""
+    """The readout noise is the same."""
     loud = World(noise_counts=2.0)
     noisy, clean = (replace(loud, off=frozenset(off)) for off in ({effect}, {effect, "noise"}))
     added = [skin.window("metal", PLACE, rng(), w).astype(float) for w in (noisy, clean)]
@@ -152,8 +148,7 @@ def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect):
 
 
 def test_noise_alone_is_white_and_has_its_standard_deviation():
-    """Noise differs between taxels and has the standard deviation of the World, plus that of
-    rounding."""
+    """Plus that of rounding; by taxel."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
     assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_counts, 12**-0.5), rel=0.05)
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
@@ -190,8 +185,7 @@ def test_the_relief_is_higher_further_forward():
 
 
 def test_rows_see_the_texture_one_after_another():
-    """Row 2 of the rough tube shows what row 3 showed 100 frames (4 mm at 3 cm/s) before; columns
-    differ."""
+    """Row 3 shows it 100 frames earlier; columns differ."""
     frames = skin.window("plastic rough", Placement(), rng(), only("texture")).astype(float)
     frames -= frames.mean(0)
     lags = np.arange(-200, 201)
@@ -204,8 +198,7 @@ def test_rows_see_the_texture_one_after_another():
 
 
 def test_force_keeps_within_a_fifth():
-    """For any error of the controller forces stay within 20 % of 1 N; they differ between sweeps
-    and vary slowly."""
+    """For any error of the controller; slow, and other each time."""
     for world in (World(), World(force_spread=0.5)):
         force = np.array([skin.drift(1500, rng(seed), world) for seed in range(40)])
         assert force.min() >= 0.8
@@ -216,8 +209,7 @@ def test_force_keeps_within_a_fifth():
 
 @pytest.mark.parametrize("kpa_per_mm", [2.0, 4.0])
 def test_the_springs_carry_the_force(kpa_per_mm):
-    """Pressure summed over the whole patch is the force that presses; a softer bed sinks in
-    deeper."""
+    """The patch carries all; a softer bed sinks in deeper."""
     force = np.array([0.8, 1.0, 1.2])
     depth = skin.indentation(force, kpa_per_mm, World())
     x, y = np.meshgrid(np.linspace(-15, 15, 301), np.linspace(-15, 15, 301))
@@ -227,8 +219,7 @@ def test_the_springs_carry_the_force(kpa_per_mm):
 
 
 def test_the_pressure_centre_moves_against_the_skin():
-    """A skin that is further forward (or across) has the contact at lower rows (or columns), if the
-    end of the pad is near."""
+    """If the end of the pad is near, in either direction."""
     still = replace(skin.LEVEL_BLIND, off=only("position").off)
     middle = centre(skin.window("metal", Placement(), rng(), still))
     ahead = centre(skin.window("metal", Placement(dx_mm=1.0), rng(), still))
@@ -257,8 +248,7 @@ def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead():
 
 
 def test_reattaching_changes_the_load_but_not_the_position():
-    """Another seed of the placement gives other gains; the same seed the same. In the level-blind
-    world they differ more."""
+    """Other gains; the same seed the same."""
     off = only("attachment").off
     for world, least in ((skin.WORLD, 0.5), (skin.LEVEL_BLIND, 3)):
         still = replace(world, off=off)
@@ -299,8 +289,7 @@ def test_sets_have_the_papers_counts(name, places, each):
 
 
 def test_positions_are_those_of_the_paper():
-    """T-REAL has nine positions within 1 mm, T-HARD one a row further forward, and no two share an
-    attachment."""
+    """Nine within 1 mm, T-HARD a row further; own attachments."""
     lab, real, hard = (skin.placements(name, 5) for name in ("T-LAB", "T-REAL", "T-HARD"))
     assert [len(lab), len(real), len(hard)] == [1, 9, 1]
     assert max(np.hypot(p.dx_mm, p.dy_mm) for p in lab + real) <= 1

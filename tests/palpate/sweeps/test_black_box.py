@@ -1,5 +1,4 @@
-"""The black box: which sweeps it keeps, over restarts and on a full disk, and that its errors never
-stop the box."""
+"""The black box: what it keeps, and that its errors never stop the box."""
 
 from __future__ import annotations
 
@@ -56,8 +55,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, code: int, fails: Callable[[], bool
 
 
 def test_the_last_sweeps_are_kept_over_restarts(tmp_path):
-    """Each new sweep pushes out the oldest sweep, also in a later run and for any status. A sweep
-    without a window does not. The folder is there before the first sweep, and free at the end."""
+    """Each pushes out the oldest, except without a window."""
     folder = tmp_path / "b"
     first = box(folder)
     assert folder.is_dir()
@@ -77,8 +75,7 @@ def test_the_last_sweeps_are_kept_over_restarts(tmp_path):
 
 
 def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch):
-    """The last sweeps exist at every moment: a sweep is removed only after the new sweep has its
-    name."""
+    """A sweep is removed after the new one has its name."""
     black = box(tmp_path)
     put(black, 1, 2, 3)
     there: list[int] = []
@@ -94,8 +91,7 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_drops_the_oldest_first(tmp_path, monkeypatch, logged):
-    """The oldest sweep is removed for a new sweep. If that does not help, one line is logged, and
-    another when writing works again."""
+    """Else one line, and another when it works again."""
     black, limit = box(tmp_path), [2]
     failing(monkeypatch, errno.ENOSPC, lambda: len(list(tmp_path.glob("*.npy"))) >= limit[0])
     put(black, 1, 2, 3, 4)
@@ -124,8 +120,7 @@ def test_another_error_removes_no_sweep(tmp_path, monkeypatch, logged):
 
 
 def test_a_folder_that_cannot_be_used_yet(tmp_path, logged):
-    """With a file instead of the folder, or another program in it, the box starts and logs one
-    line. Later the folder can be used."""
+    """The box starts with one line; later it can be used."""
     folder = tmp_path / "b"
     folder.write_text("in the way")
     black = box(folder)

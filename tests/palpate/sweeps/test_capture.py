@@ -54,8 +54,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(path):
-    """A skin that was too fast must send for some seconds before it streams. Replay gives exactly
-    the frames that the sensor returned."""
+    """After it was too fast, for seconds."""
     capture = CaptureWriter(path, profile("matrix").format, profile("matrix"))
     wired = WiredSkin("matrix", rate=2.0, tap=capture)
     wired.seconds(4)
@@ -79,8 +78,7 @@ def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(path):
 
 @pytest.mark.slow
 def test_a_capture_gives_the_same_verdicts_bit_for_bit(rigged, default_bundle, path):
-    """With drift, spikes, lost transfers, an unplugged skin and NEW OBJECT, replay gives the same
-    windows, times and scores."""
+    """With drift, losses, an unplugged skin and NEW."""
     rng = np.random.default_rng(5)
     acts = list(script.tubes(1010, 8, only="wood"))
     acts[3] = rig.Act(acts[3].frames, acts[3].start, acts[3].stop, acts[3].label, new_object=True)
@@ -112,8 +110,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(rigged, default_bundle, p
 
 @pytest.mark.slow
 def test_commands_are_part_of_a_capture(rigged, default_bundle, path):
-    """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
-    before."""
+    """NEW and ABORT: sweeps are fused and end as before."""
     simulated = tubes(1014, 5, only="wood")
     capture = CaptureWriter(path, skin.FORMAT)
     box = rigged(simulated, capture=capture)
@@ -130,8 +127,7 @@ def test_commands_are_part_of_a_capture(rigged, default_bundle, path):
 
 
 def test_a_capture_of_a_skin_that_sent_another_format(rigged, default_bundle, path):
-    """After packets of another grid in the stream the sweep is `sensor-lost`, live and in the
-    replay. After a power cut within a record, all earlier records are played."""
+    """`sensor-lost` both times; a cut record ends it."""
     simulated = tubes(1015, 2)
     count = itertools.count()
     other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
@@ -150,8 +146,7 @@ def test_a_capture_of_a_skin_that_sent_another_format(rigged, default_bundle, pa
 
 
 def test_a_restart_keeps_the_capture_before(tmp_path, path, logged):
-    """Earlier captures get the next number. If there are too many, the start is refused and nothing
-    is overwritten."""
+    """The next number; too many refuse the start."""
     for edges in range(3):
         capture = CaptureWriter(path, skin.FORMAT)
         capture.edges(7, [Edge(EdgeKind.START, 7)] * edges)

@@ -25,8 +25,7 @@ def test_each_material_is_wanted_at_every_position():
 
 
 def test_nothing_is_missing_at_the_target():
-    """Two materials with enough sweeps each; more than enough is fine. After its last sweep was
-    removed, a pair is no longer listed. A sweep without a material never counts."""
+    """A removed pair is not listed; no material never counts."""
     assert "material" in counted(1).missing()
     progress = counted(1, ("a", ""))
     assert "material" in progress.missing()

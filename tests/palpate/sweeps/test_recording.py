@@ -1,5 +1,4 @@
-"""Recordings: which labels a sweep gets, what REC reports, and a disk that is full, read-only or in
-use."""
+"""Recordings: labels, what REC reports, and a disk that is full, read-only or in use."""
 
 from __future__ import annotations
 
@@ -127,8 +126,7 @@ def heard(box: Rigged) -> list[list[str]]:
 
 
 def test_a_label_applies_to_sweeps_that_start_after_it(recorded, tmp_path):
-    """On the serial line with real edges, a label that is sent during a sweep applies to the next
-    sweep. The three seconds before the first sweep are enough for the first command."""
+    """On the serial line with real edges."""
     first, *others = script.tubes(1, 3)
     quiet = np.concatenate([np.zeros((3 * 750, 4, 4), np.uint8), first.frames])
     first = rig.Act(quiet, 3 * 750 + first.start, 3 * 750 + first.stop, "")
@@ -152,8 +150,7 @@ def test_a_label_applies_to_sweeps_that_start_after_it(recorded, tmp_path):
 
 
 def test_a_sidecar_holds_everything(recorded, tmp_path):
-    """The sidecar has verdict, readout board, clock, trigger, unloaded skin and run in plain JSON,
-    and nothing of a bundle. The start was a GPIO line, without speed and force."""
+    """In plain JSON, and nothing of a bundle or of a START command."""
     simulated = tubes(2, 1)
     box = recorded(simulated, Labels("wood", "3", "monday"))
     (verdict,) = box.until(lambda: simulated.finished(box.box.answered))
@@ -175,8 +172,7 @@ def test_a_sidecar_holds_everything(recorded, tmp_path):
 
 
 def test_a_recording_is_a_set_to_train_on(recorded, tmp_path):
-    """`palpate-train --set DIR` reads the materials, positions, sessions and windows that the box
-    recorded."""
+    """`palpate-train --set DIR` reads what the box recorded."""
     simulated = tubes(3, 2)
     box = recorded(simulated, Labels("wood", "1", "a"))
     box.until(lambda: box.box.answered == 1)
@@ -190,8 +186,7 @@ def test_a_recording_is_a_set_to_train_on(recorded, tmp_path):
 
 
 def test_speed_and_force_reach_sidecar_feed_and_set(rigged, tmp_path):
-    """Two sweeps by command with `palpate record`: the values are in each sidecar, in the feed's
-    verdict, and are groups of the set."""
+    """Two sweeps by command with `palpate record`."""
     acts = [rig.Act(numbered(20 * 750), 10**7, 10**7 + 1, "")]
     simulated = played(acts)
     session = RecordingSession(tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None)
@@ -231,8 +226,7 @@ def test_rec_says_what_became_of_each_sweep(tmp_path):
 
 
 def test_the_label_at_the_start_edge_counts(tmp_path):
-    """Each sweep has the labels that applied at its start, even if it is answered after a later
-    sweep. A sweep that began before all kept changes has no label."""
+    """Whenever it is answered; before all kept changes none."""
     desk = Desk(tmp_path, Labels())
     for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
         desk.t_ns = t_ns
@@ -276,8 +270,7 @@ def test_labels_that_cannot_be_sent(tmp_path, text):
 
 
 def test_discard_takes_the_last_and_then_the_one_before(tmp_path):
-    """DISCARD can remove all sweeps of this run and no sweep of an earlier run. No number is used
-    twice, even after a restart."""
+    """Of this run alone; no number comes twice."""
     before = Desk(tmp_path)
     before.sweep(1)
     before.recording.close()
@@ -301,8 +294,7 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path):
 
 
 def test_an_answer_that_waits_for_the_disk_holds_up_no_other(rigged, tmp_path):
-    """DISCARD is answered once its sweep is off the disk, also when the program ends. Others
-    are answered meanwhile."""
+    """DISCARD once off the disk, also at the end."""
     simulated, disk = tubes(4, 2), SlowDisk()
     recording = RecordingSession(
         tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None, disk=disk
@@ -327,8 +319,7 @@ def test_an_answer_that_waits_for_the_disk_holds_up_no_other(rigged, tmp_path):
 
 
 def test_discard_of_the_sweep_that_was_seen(tmp_path):
-    """With a number, DISCARD removes the last stored sweep only if it has this number, and never a
-    later sweep."""
+    """With a number only if it is the last one's."""
     desk = Desk(tmp_path)
     for n in (1, 2):
         desk.sweep(n)
@@ -379,8 +370,7 @@ def test_a_sweep_is_moved_a_material_renamed_and_that_undone(tmp_path):
 
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_what_became_of_the_last_sweep_is_kept(tmp_path, earlier):
-    """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would
-    remove. Sweeps of an earlier run do not count."""
+    """As in REC, for displays; an earlier run does not count."""
     before = Desk(tmp_path)
     for n in range(earlier):
         before.sweep(n + 1)
@@ -405,8 +395,7 @@ def test_what_became_of_the_last_sweep_is_kept(tmp_path, earlier):
 
 
 def test_the_log_says_what_is_missing(tmp_path, logged):
-    """After each sweep, per material and position, with those of earlier runs; a faulty window does
-    not count."""
+    """By material and position, with earlier runs, without faults."""
     before = Desk(tmp_path, Labels("wood", "1"), target=2)
     before.sweep(1)
     before.recording.close()
@@ -436,8 +425,7 @@ def test_the_log_says_what_is_missing(tmp_path, logged):
 
 
 def test_a_folder_of_another_format_is_refused(tmp_path):
-    """A model cannot be trained on sweeps of two formats. The folder does not change and can be
-    used by other programs; a damaged sweep there is neither counted nor refused."""
+    """It stays as it is; a damaged sweep there is no matter."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
@@ -449,8 +437,7 @@ def test_a_folder_of_another_format_is_refused(tmp_path):
 
 
 def test_discard_that_fails_can_be_repeated(tmp_path, monkeypatch):
-    """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD
-    can remove the rest."""
+    """The sweep counts as stored until the rest is removed."""
     desk, rename = Desk(tmp_path), Path.replace
     desk.sweep(1)
 
@@ -469,8 +456,7 @@ def test_discard_that_fails_can_be_repeated(tmp_path, monkeypatch):
 
 
 def test_a_later_run_writes_nothing_over(tmp_path):
-    """Numbers continue; only unfinished files of a killed run are removed; an incomplete sweep
-    keeps its number."""
+    """Unfinished files go; an incomplete sweep keeps its number."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
@@ -508,8 +494,7 @@ def test_one_program_at_a_time_has_a_folder(tmp_path):
 def test_no_room_for_the_system_stops_recording(
     tmp_path, monkeypatch, blocks, left, detail, logged
 ):
-    """In the reserved space nothing is written: REC says so, and one line is logged. Each sweep
-    tries again, and one line is logged after a success."""
+    """REC and one line; each sweep tries again."""
     free = [left]
 
     def statvfs(path: object) -> os.statvfs_result:
@@ -540,8 +525,7 @@ def test_a_disk_that_refuses(tmp_path, monkeypatch, code, outcome, logged):
 
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path, logged):
-    """If the disk is full after n bytes, for any n within both files, the sweep has failed, no part
-    of it stays, and existing files are complete."""
+    """Full after n bytes, for any n within both files."""
     desk = Desk(tmp_path)
     desk.sweep(1)
     before = content(tmp_path)
@@ -565,8 +549,7 @@ def test_a_folder_that_cannot_be_made(folder):
 
 
 def test_folders_are_on_the_disk_before_their_sweeps(tmp_path, monkeypatch):
-    """Each folder is synced into its parent at every start, so a power failure cannot remove the
-    sweeps later."""
+    """Synced into their parents at every start."""
     synced: list[Path] = []
     monkeypatch.setattr(sweep_folder.storage, "sync", synced.append)
     for _ in range(2):
@@ -576,8 +559,7 @@ def test_folders_are_on_the_disk_before_their_sweeps(tmp_path, monkeypatch):
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():
-    """Floats keep their bits in JSON, even without a short decimal form, and no field is left
-    out."""
+    """Also without a short form; no field is left out."""
     _, verdict = judged(1)
     again = json.loads(json.dumps(verdict.as_dict()))
     assert again == verdict.as_dict()
@@ -588,8 +570,7 @@ def test_numbers_in_a_verdict_come_back_bit_for_bit():
 
 
 def test_display_names_outlast_the_run(tmp_path):
-    """The sidecar keeps the typed name; the next run and the set of the folder have it; a name that
-    cannot be shown is passed over."""
+    """In sidecar, next run and set; unprintable ones are passed over."""
     for run in range(2):
         one = RecordedPage(tmp_path, Labels())
         assert one.recording.names.displays == ({"Holz geoelt": "Holz, geölt"} if run else {})

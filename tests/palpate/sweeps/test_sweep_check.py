@@ -91,8 +91,7 @@ def test_a_sweep_that_is_too_short_keeps_its_status(rigged):
 
 @pytest.mark.parametrize("tare", [False, True])
 def test_contact_that_cannot_be_judged_is_said(rigged, tare):
-    """If the finger never touched the skin, sweeps are recorded, and the answer says that contact
-    was not checked. TARE says that nothing touches the skin now, and makes it certain."""
+    """Until TARE, or a touch, makes it certain."""
     box = recording(rigged, rig.Act(lifted(12), 3 * RATE, 6 * RATE, ""))
     box.seconds(1)
     if tare:
@@ -104,8 +103,7 @@ def test_contact_that_cannot_be_judged_is_said(rigged, tare):
 
 
 def test_commands_that_need_a_bundle(rigged):
-    """ID says that sweeps are recorded, and gives the skin's format. TEST says that there is
-    nothing to test."""
+    """ID gives the skin's format; TEST has nothing to test."""
     box = recording(rigged, played(slide()))
     box.seconds(0.5)
     said = box.ask("$PPLP,ID")
@@ -138,8 +136,7 @@ def test_an_impossible_reading_is_no_good_sweep():
 
 @pytest.mark.parametrize("level", [0, 77, 255])
 def test_a_skin_on_which_no_taxel_changes_is_no_good_sweep(level: int):
-    """A loose cable, before the skin was seen with and without contact; a single taxel that moves
-    is enough to count it."""
+    """A loose cable; one that moves is enough."""
     check = SweepCheck(skin.FORMAT, rig.VirtualClock())
     taxels = np.full((1500, 4, 4), level, np.uint8)
     stream(check, taxels)
@@ -150,8 +147,7 @@ def test_a_skin_on_which_no_taxel_changes_is_no_good_sweep(level: int):
 
 
 def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
-    """One loaded taxel is named; what else a slide is, the given check says. A fault of the skin
-    comes first, and without a check everything is recorded."""
+    """By the given check, after faults of the skin."""
     off, on = lifted(), slide()
     one = np.tile(off[:1], (1500, 1, 1))
     one[:, 2, 1] = on[:1500].max(axis=(1, 2))

@@ -1,5 +1,4 @@
-"""SweepCutter: every trigger gets one answer, and the window is the middle of the sweep to the
-frame."""
+"""SweepCutter: every trigger gets one answer, and the window is the sweep's middle."""
 
 from typing import Any
 
@@ -95,8 +94,7 @@ SCRIPTS = {
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_each_trigger_is_answered_once(name):
-    """In the order of the triggers, and at the time at which it is due. The numbers of the sweeps
-    count from 1."""
+    """In their order, when due, numbered from 1."""
     bench, answers = Bench(late_ms=500, max_duration_s=6), []
     for step in SCRIPTS[name].split(";"):
         what, *words = step.split()
@@ -118,8 +116,7 @@ def test_each_trigger_is_answered_once(name):
 
 
 def test_middle_window():
-    """Start at frame 500, stop at 2750: the window is frames 875 to 2374, unchanged. A window of an
-    odd number of frames has one frame in its middle."""
+    """Frames 875 to 2374 of 500 to 2750; an odd number has one in its middle."""
     sweep = sweep_of(frames(0, 3000))
     assert (sweep.status, sweep.lost) == (Status.OK, 0)
     assert (sweep.frames.seq == np.arange(875, 2375)).all()
@@ -153,8 +150,7 @@ def test_every_axis_is_interpolated():
     "drop", [(1000,), (1000, 1001), (875,), (875, 876), (2373, 2374), (900, 905, 906, 2000)]
 )
 def test_short_gaps_are_interpolated_and_counted(drop):
-    """One or two missing frames, also at the window's ends: filled on the line between neighbours,
-    counted as lost."""
+    """One or two frames, also at the window's ends."""
     sweep = sweep_of(frames(0, 3000, drop))
     assert (sweep.status, sweep.lost) == (Status.OK, len(drop))
     assert sweep.filled is not None
@@ -170,8 +166,7 @@ def test_short_gaps_are_interpolated_and_counted(drop):
 
 @pytest.mark.parametrize("first", [873, 875, 1500, 2372, 2374])
 def test_wider_gaps_are_not_interpolated(first):
-    """Three frames in a row that are missing, wholly or partly in the window, make the status
-    `gap`, without frames."""
+    """Three in a row, wholly or partly in the window: `gap`."""
     sweep = sweep_of(frames(0, 3000, tuple(range(first, first + MAX_GAP + 1))))
     assert (sweep.status, len(sweep.frames)) == (Status.GAP, 0)
     assert 0 < sweep.lost <= MAX_GAP + 1
@@ -243,8 +238,7 @@ def test_latest_is_complete_or_none():
 
 @pytest.mark.parametrize("packet", [1, 6, 40, 1000])
 def test_an_open_sweep_so_far(packet):
-    """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the
-    frames come."""
+    """Nine steps from `lead_ms` on, each once, however frames come."""
     bench, seen = Bench(lead_ms=400), []
     bench.put(frames(0, 510))
     assert bench.steps() == []
@@ -298,8 +292,7 @@ def test_steps_of_a_window_that_does_not_divide():
 
 
 def test_no_step_lies_beyond_a_gap():
-    """Three missing frames end the steps, also later ones; two are interpolated, from both
-    sides."""
+    """Three end the steps, also later ones; two are interpolated."""
     bench = Bench(lead_ms=0)
     bench.edge(START, 0)
     bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))
@@ -327,8 +320,7 @@ def test_a_sweep_that_is_settled_has_had_its_answer():
 
 
 def test_steps_wait_for_the_previous_answer_and_for_the_same_skin():
-    """While an earlier sweep waits for frames after a gap the open sweep has no step. Frames of a
-    skin that was plugged in again do not belong to the sweep that was open before."""
+    """Not after a gap or a replug."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 1700))
     bench.edge(START, 0)
@@ -354,8 +346,7 @@ EDGES = st.tuples(
 @pytest.mark.slow
 @given(st.lists(EDGES, max_size=30))
 def test_every_start_gets_exactly_one_answer(script):
-    """For any edges in any order, with some sweeps settled at a step: each number is answered
-    once."""
+    """For any edges, with some sweeps settled at a step."""
     bench = Bench(max_duration_s=5, lead_ms=0)
     frame = starts = 0
     answers: list[Sweep] = []

@@ -24,8 +24,7 @@ def box(tmp_path: Path) -> Classifier:
 
 
 def kept(folder: Path, box: Classifier, *places: tuple[float, float]) -> list[str]:
-    """Answer sweeps at these places of the embedding in one run, and keep them as the box does; the
-    details of the answers."""
+    """Answer sweeps at these places of the embedding and keep them; their details."""
     black_box, said = BlackBox(folder, box.bundle.format, 500), []
     for i, place in enumerate(places, 1):
         sweep = toy_bundle.sweep(*place, number=i, object=i)
@@ -42,8 +41,7 @@ def numbers(folder: Path, box: Classifier) -> list[list[int]]:
 
 
 def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path, box):
-    """Each run counts from 1; a material that was seen once is none, nor is a known one, nor an
-    answer of another bundle."""
+    """None of one sweep, known or another bundle."""
     folder = tmp_path / "black-box"
     said = kept(folder, box, FELT[0], CORK[0], (0, 0), FELT[1], (60, -60), CORK[1], FELT[2])
     alike = [one.rpartition("; ")[2] for one in said if "; as" in one]

@@ -1,5 +1,4 @@
-"""`palpate check --bench`: the keys of its JSON, and the parts that are measured in processes of
-their own."""
+"""`palpate check --bench`: the keys of its JSON, and parts measured in own processes."""
 
 from __future__ import annotations
 

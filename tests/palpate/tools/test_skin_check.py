@@ -1,5 +1,4 @@
-"""Conformance of readout boards: a sound board passes over each link, and each fault is found and
-named."""
+"""Conformance of readout boards: a sound board passes, each fault is found and named."""
 
 from __future__ import annotations
 

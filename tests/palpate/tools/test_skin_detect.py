@@ -1,5 +1,4 @@
-"""`palpate skin detect` and `skin list`: every delivered skin is found by its ids or by listening;
-nothing is written to a port unasked."""
+"""`skin detect` and `skin list`: by ids or by listening; nothing is written unasked."""
 
 from __future__ import annotations
 
@@ -112,8 +111,7 @@ def test_a_port_that_is_held():
 
 
 def test_the_commands(capsys, tmp_path, monkeypatch):
-    """list: a table of all profiles, and a line for one that cannot be read; detect: --write needs
-    --port, a silent port says what to do."""
+    """Tables, an unreadable profile, --write needs --port, a silent port."""
     assert main(["skin", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert {line.split()[0] for line in lines} >= set(PROFILES), (
@@ -201,8 +199,7 @@ def test_other_speeds_are_tried_until_one_gives_text(baud):
 
 @pytest.mark.parametrize(("sent", "code"), [(numbers, 0), (lambda i: b"Press any key\n", 69)])
 def test_a_profile_is_written(capsys, tmp_path, monkeypatch, sent, code):
-    """It can be loaded; a name or a grid that is not allowed, and a file that exists, are refused
-    before the port is opened."""
+    """It loads; what is not allowed is refused before the port is opened."""
     clock = VirtualClock()
     opened = lambda path, baud, clock: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
     monkeypatch.setattr("palpate.io.serial_link.SerialLink", opened)

@@ -65,9 +65,7 @@ ENDS = at(signal(1), ((ALL, 1, 1), 255), ((ALL, 0, 0), 0))
     ],
 )
 def test_faulty_taxels_are_named(taxels, dtype, kind, names):
-    """One value for seconds while others move, no load while others are touched, and a count at
-    the end of its type. Where all stand still, that is
-    said."""
+    """Still among moving, without load, at the type's end; or all still."""
     found = monitor(taxels, dtype)
     assert found[kind] == names
     axes = taxels.shape[3:] or (1,)

@@ -205,8 +205,7 @@ FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number)
     ],
 )
 def test_the_arrow_points_where_the_skin_has_to_go(browser, page, centre, message, way):
-    """Towards the row or column that the message names, in the picture and beside the words: a skin
-    on which the contact lies too far towards row 1 is moved towards row 1."""
+    """Towards the named row or column, drawn and in words."""
     nearest = min(
         zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre)
     )

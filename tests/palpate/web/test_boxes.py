@@ -10,8 +10,7 @@ from palpate.web.boxes import KEPT_NS, OtherBoxes
 
 
 def test_pages_of_other_boxes_are_listed_once_a_minute(monkeypatch):
-    """One entry for each box with a page; not this box, and no bridge. Without zeroconf there is
-    nothing to list."""
+    """Not this box or a bridge; none without zeroconf."""
     own, asked, clock = network.box_id(), [], VirtualClock()
     there = [
         Reachable(f"here-{own}", "page", "10.0.0.1", 8137),

@@ -1,5 +1,4 @@
-"""The page of a recording, without a browser: the loop carries out its orders, refuses others, and
-never waits."""
+"""The page of a recording: the loop carries out orders, refuses others, never waits."""
 
 from __future__ import annotations
 
@@ -191,8 +190,7 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(rigged, tmp_path):
 
 
 def test_the_page_hears_what_there_is(recorded):
-    """The page gets labels, counts, missing sweeps, and the result and checks of the last sweep;
-    the skin only while a browser is connected."""
+    """All of the recording; the skin while a browser is connected."""
     reader = EventReader(recorded.page.server)
     assert reader.until("key") == recorded.page.server.key
     until(lambda: recorded.page.server.watched)
@@ -236,8 +234,7 @@ class Obedient(RecordedPage):
 
 
 def test_a_role_has_its_orders_and_those_of_the_roles_before(tmp_path):
-    """The role look gives no order, and operate gives none of teaching. A refused order does not
-    reach the loop."""
+    """A refused one does not reach the loop."""
     tokens = tuple(f"{role}0123456789abcdef" for role in ROLES)
     with Obedient(tmp_path, Labels(), access=Access(0, tokens=tokens), teaching=True) as one:
         for asked, codes in (("START", (409, 200, 200)), ("USE", (409, 409, 200))):
@@ -283,8 +280,7 @@ def test_too_large_a_body_is_refused(recorded, chunked):
 
 
 def test_refusals_say_why(recorded, tmp_path):
-    """As a line of text that names the value; the labels stay. Orders that wait when the recording
-    ends are refused, and none is carried out."""
+    """With the value; labels stay; orders that wait at the end are refused."""
     page = recorded.page.server
     answer = ordered(page, page.key, {"command": "MATERIAL", "text": "-1"})
     assert (status(answer), b"text/plain" in answer, b"'-1'" in answer) == (409, True, True)
@@ -322,8 +318,7 @@ def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded, mo
     ("under_way", "why"), [(False, b"was not carried out"), (True, b"may still be carried out")]
 )
 def test_a_loop_that_is_late(recorded, monkeypatch, under_way, why):
-    """After DONE_S the page learns whether the order is under way, as on a slow disk, or was never
-    taken up; then it is not carried out later."""
+    """After DONE_S: under way, or never taken up and never done later."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
     answered, turns = threading.Event(), []
     if under_way:

@@ -1,5 +1,4 @@
-"""The page of `palpate record --web` in a headless browser: content, labels, and layout at three
-sizes."""
+"""The page of `palpate record --web` in a browser: content, labels, three sizes."""
 
 from __future__ import annotations
 
@@ -158,8 +157,7 @@ def test_labels_are_set_in_fields_and_in_the_table(browser, recorded):
 
 
 def test_start_and_stop(browser, recorded):
-    """By the buttons, which can be pressed while they have an effect, and by Space, also after a
-    button was pressed with the mouse; in a field it is a space."""
+    """By the buttons while they act, and by Space, except in a field."""
     seen = opened(browser, recorded)
     until(lambda: seen.text("#call") == "Press Start, Space or the pedal")
     for button, other, state in (("#start", "#stop", "sweeping"), ("#stop", "#start", "ready")):
@@ -237,8 +235,7 @@ def test_the_sweep_on_the_button_is_discarded(browser, recorded, tmp_path):
 
 
 def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser, tmp_path):
-    """The page says that the recorder has ended, and its controls are off. It shows the next run by
-    itself, and orders have the new key."""
+    """Controls are off; then a new key."""
     first = begun(tmp_path / "a")
     with first:
         seen = opened(browser, first)
@@ -270,8 +267,7 @@ CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
     ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
 )
 def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
-    """Text, an error and a banner have a contrast of 4.5 with their background (WCAG 2.1, 1.4.3).
-    The longest names and more positions than fit stay within the page."""
+    """Contrast of 4.5 (WCAG 2.1, 1.4.3); the longest names fit."""
     recorded.recording.commands["MATERIAL"]("corrugated cardboard 2mm")
     for position in range(3, 15):
         recorded.recording.commands["POSITION"](f"{position}")
@@ -317,8 +313,7 @@ PRESS = ":not([aria-disabled=true])"
 
 
 def test_a_sweep_with_the_wrong_material_is_moved(browser: Any, recorded: RecordedPage):
-    """Its right material is set, then one press; a material gets another name; Undo takes back the
-    last of these."""
+    """One press; renamed; Undo takes back the last."""
     seen = opened(browser, recorded)
     recorded.sweep()
     until(lambda: seen.text("#outcome").startswith("wood at 1, stored"))
@@ -382,8 +377,7 @@ SMALL = """() => [...document.querySelectorAll("button, input")].filter((e) => e
 def test_a_person_sees_each_control_of_a_page(
     browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
 ):
-    """With a sweep that can be moved and one moved back, nothing lies on another thing, is cut, is
-    too faint or too small for a finger."""
+    """Nothing is covered, cut, too faint or too small."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
         number = one.sweep()
         suspect = {"sweep": f"sweep-{number:06d}", "looks_like": "wood", "text": "like wood"}
@@ -414,8 +408,7 @@ for (const [of, name] of [[Array.prototype, "at"], [Element.prototype, "replaceC
 
 
 def test_orders_of_an_older_browser_are_sent(browser: Any, recorded: RecordedPage):
-    """Without what came after 2020; and an error of script is not called one of the network, and
-    does not stop the next order."""
+    """Of 2020; an error of script stops no later order."""
     context = browser.new_context()
     context.add_init_script(OLDER)
     seen = BrowsedPage(context, recorded.page.server.address)

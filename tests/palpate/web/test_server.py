@@ -53,8 +53,7 @@ def guarded(
 
 
 def test_events_are_numbered_and_the_newest_are_kept():
-    """The requested number of events of each name is kept, else the newest; in order. A browser
-    gets later events, a browser of another server all events."""
+    """So many a name; another server's browser gets all."""
     log = EventLog({"row": 2})
     for i in range(4):
         log.add("row", i)
@@ -167,8 +166,7 @@ ABSOLUTE = re.compile(r"""(?:from|fetch\(|EventSource\(|href=|src=|replace\() ?[
 
 
 def test_pages_run_in_browsers_of_2020_behind_any_path():
-    """No script of a page needs what is younger, and each address is relative, so that a proxy may
-    serve the pages below a path of its own."""
+    """No younger script, and relative addresses."""
     found = {f.name: f.read_text() for f in server.FOLDER.iterdir()}
     assert len(found) > 15
     for name, text in found.items():

@@ -1,5 +1,4 @@
-"""The page of `palpate watch --web` in a headless browser: content, use, and layout at three
-sizes."""
+"""The page of `palpate watch --web` in a browser: content, use, three sizes."""
 
 from __future__ import annotations
 
@@ -63,8 +62,7 @@ def test_a_sweep_without_a_label_says_why(browser, shown):
 
 
 def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser, shown):
-    """The last sweep is shown by itself, and another sweep after a click, until the latest is asked
-    for. An old sweep no longer has a signal."""
+    """The last, or a clicked one while kept."""
     seen = opened(browser, shown)
     scores = seen.page.locator("#scores li").all_inner_texts()
     assert len(scores) == 6
@@ -178,8 +176,7 @@ def test_unsigned_bundles_are_told_at_the_top(browser, shown):
 
 
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser, shown):
-    """The page says at once that the box is off, and since when; the reason is behind a fold. It
-    shows the new box and bundle by itself, and its card waits for a sweep of the new box."""
+    """Off since when and why; then the new box."""
     seen = opened(browser, shown)
     assert not seen.page.is_visible("#banner")
     shown.board.take({"type": "closed", "why": "the box is stopping"})
@@ -287,8 +284,7 @@ SHOWN = {
 @pytest.mark.parametrize(("width", "height"), [*SIZES[:2], (1920, 1080)])
 @pytest.mark.parametrize("at", SHOWN)
 def test_every_text_can_be_read(browser, shown, width, height, scheme, at):
-    """All text has a contrast of 4.5 with its background (WCAG 2.1, 1.4.3), also with a banner and
-    each tone; nothing is too wide."""
+    """Contrast of 4.5, also with a banner and each tone; nothing too wide."""
     for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
         moved = "moved 2 mm too far towards row 1"
         shown.board.take(feed_lines.verdict(number, 390.0, "wood", status, moved=moved))

@@ -1,5 +1,4 @@
-"""The states of `palpate watch --web` as an operator sees them from two metres, and the use of the
-page on a tablet, in a headless browser."""
+"""The states of `palpate watch --web` from two metres, and its use on a tablet."""
 
 from __future__ import annotations
 
@@ -117,8 +116,7 @@ def fits(seen: BrowsedPage, width: int, height: int) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_each_state_is_told_from_two_metres(browser, shown, width, height, scheme):
-    """Colour, shape and word differ between an answer, a refusal, a fault and a box that is off;
-    what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), on the whole screen too."""
+    """By colour, shape and word, with what to do, readable."""
     size = {"width": width, "height": height}
     context = browser.new_context(viewport=size, color_scheme=scheme)
     seen = BrowsedPage(context, shown.server.address + "/#watch")
@@ -163,8 +161,7 @@ def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
 
 
 def test_an_open_sweep_does_not_wear_the_answer_of_the_last(browser: Any, shown: Shown):
-    """The state is large and the answer of before small, until this sweep is answered, early or at
-    its end."""
+    """It is small until this one is answered."""
     seen = opened(browser, shown)
     sweep()(shown)
     until(lambda: seen.text("#label") == "wood")
@@ -257,8 +254,7 @@ def test_keys_lead_to_views_and_history(browser, shown):
 
 
 def test_the_shift_is_counted_and_saved(browser, shown):
-    """A sentence, a table, and a CSV file with each sweep and its time on the wall, also of what
-    came after the page was opened."""
+    """A sentence, a table, a CSV file, also of what came later."""
     seen = opened(browser, shown)
     shown.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
     until(lambda: seen.text("#tally-counted").startswith("41 sweeps since "))
@@ -305,8 +301,7 @@ def test_history_goes_on_after_a_restart(browser, tmp_path):
 
 
 def test_the_start_leads_to_each_page(browser, shown):
-    """It has links to the views, to other boxes, and to the page of teaching while that runs. It
-    makes no link of an address that would run a script."""
+    """Views, other boxes, teaching; no link that runs a script."""
     evil, cell = "javascript:alert(1)", "https://cell-7.local:8137/"
     shown.boxes += [{"name": "evil", "address": evil}, {"name": "cell-7", "address": cell}]
     seen = BrowsedPage(browser.new_context(), shown.server.address)

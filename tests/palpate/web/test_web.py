@@ -51,8 +51,7 @@ def heard(
     reader: EventReader,
     wanted: object = None,
 ) -> object:
-    """The next event of this name, with the turns and steps that it takes. wanted: its content;
-    others are skipped, since a slow reader gets several events of a box that is away."""
+    """The next event of this name, with its turns. wanted: its content; others are skipped."""
     reader.socket.settimeout(0.01)
     end = time.monotonic() + WAIT_S
     while time.monotonic() < end:
@@ -103,8 +102,7 @@ def test_frames_are_asked_for_while_somebody_watches(watcher, path):
 
 
 def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher, path):
-    """The page gets at once that the box is away, and why. Then it gets the new box, and the
-    history has the changes."""
+    """Away and why; the history has the changes."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     heard(watcher, offered, "box", reader, wanted={"there": True, "why": ""})
@@ -145,8 +143,7 @@ RUBBISH = [
 
 @pytest.mark.parametrize("sent", RUBBISH, ids=range(len(RUBBISH)))
 def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(watcher, path, sent):
-    """For any content the page shows a box that is away. The server continues, and reads a real
-    feed that comes later."""
+    """And a real feed is read later."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen()
