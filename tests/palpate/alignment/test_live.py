@@ -165,7 +165,7 @@ def test_a_line_says_what_it_is_of(source, word):
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
 def test_align_with_what_is_simulated(which, want, tmp_path, default_bundle, capsys, monkeypatch):
-    """`align --sim skin` and `--sim replay:SET` find a contact and say what they show."""
+    """`align --sim skin` and `--sim replay:SET` find a contact and say their source."""
     np.savez(
         tmp_path / "s.npz",
         samples=default_bundle.golden,

@@ -236,7 +236,7 @@ def test_no_early_answer_for_an_unknown_material(tmp_path):
 
 
 def test_distances_have_the_shape_of_each_step():
-    """The second direction may count half; what is no number lies within no limit."""
+    """The second direction may count half; NaN lies within no limit."""
     shapes = np.stack([np.eye(2), np.diag([1, 0.5])]).astype(np.float16)
     classes = EarlyClasses(np.tile(toy_bundle.MEANS, (2, 1, 1)), shapes)
     distances = EarlyDistances(classes, (4.0, 4.0))

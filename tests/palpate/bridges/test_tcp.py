@@ -59,7 +59,7 @@ LONGEST = (
 
 
 def test_the_short_form_fits_a_string_of_80_characters(box):
-    """The longest of each kind: the client reads what counts."""
+    """The longest of each kind: status, label, probability."""
     lines = [sentence("RES", *LONGEST), state(), result(2)]
     with (
         bridge("tcp", "--port", box.path, "--short") as address,

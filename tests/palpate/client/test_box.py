@@ -81,7 +81,7 @@ def test_what_the_box_is(box):
 
 
 def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking, box):
-    """FIN before RES, of this sweep alone; they are no answers."""
+    """FIN before RES, of this sweep alone, not counted as answers."""
     speaking.say(finger("left", 6))
     speaking.say(finger("left", 7))
     speaking.say(finger("right", 7, "no-contact", "", "0.000"))

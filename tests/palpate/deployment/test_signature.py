@@ -141,7 +141,7 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers, te
     ],
 )
 def test_faults_of_ssh_keygen_that_pass_are_tried_again(monkeypatch, tmp_path, fault, code):
-    """Only what a person can mend keeps the service down."""
+    """Only a fault for a person keeps the service down."""
 
     def fails(*words: object, **options: object) -> object:
         if isinstance(fault, Exception):

@@ -383,7 +383,7 @@ def test_start_and_stop(need):
 
 
 def test_one_line(need):
-    """A rise is START and a fall STOP, in one call or several; high at first is no START."""
+    """A rise is START and a fall STOP, in one call or several; a high line makes no START."""
     u = need("lines")
     u.drive(u.trigger.start, True)
     with Watcher(u, mode="one-line") as watcher:

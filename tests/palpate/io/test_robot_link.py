@@ -243,7 +243,7 @@ def test_too_few_class_bits():
 
 
 def test_a_line_that_echoes_gets_no_answers():
-    """Own sentences, whole or in part, are no commands; one among them is."""
+    """Own sentences, whole or in part; a command among them counts."""
     own = [sentence(kind, 1, "ok") for kind in OWN]
     found, rest = parse(b"".join(own) + b"$PPLP,ID\r\n" + own[0][:7])
     assert [c.name for c in found] == ["ID"]

@@ -154,7 +154,7 @@ def test_a_material_keeps_its_name_for_people(box, capsys):
 
 
 def test_a_delivery_during_use_is_not_replaced(box, capsys, monkeypatch):
-    """It stays, and the person who teaches is told."""
+    """It stays, and a line says so to the person who teaches."""
     taught = materials.taught
 
     def slowly(*given: Any, **more: Any) -> enrolment.Enrolment:

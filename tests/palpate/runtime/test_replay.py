@@ -137,7 +137,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle):
 
 @pytest.mark.slow
 def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle):
-    """Another object's sweep of another bundle is no matter."""
+    """Sweeps of other objects and bundles do not matter."""
     folder, heard = in_service
     change(at(folder, 2), bundle="0badcafe")
     for n in (1, 11, 30):
@@ -228,7 +228,7 @@ def test_every_difference_is_told(in_service, default_bundle):
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle):
-    """Anywhere: what changes no score changes the checksum."""
+    """Anywhere in the file: by a score, else by the checksum."""
     folder, _ = in_service
     path = at(folder, 3)
     data = path.read_bytes()

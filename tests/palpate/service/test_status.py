@@ -89,7 +89,7 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file):
 
 
 def test_every_user_may_read_it_whole(status_file):
-    """Mode 644 under any umask; whole for whoever had it open."""
+    """Mode 644 under any umask; a reader that had it open has all of it."""
     before = os.umask(0o027)
     try:
         status_file.turns(0.01)

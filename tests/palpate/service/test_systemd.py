@@ -143,7 +143,7 @@ TEXTS = ["10s", "-5", "1e6", "\u0663", "9" * 5000, "0x10", " "]
     ],
 )
 def test_no_watchdog_or_another_s_is_not_fed(socket_end, more, told, logged):
-    """Unset or not ours; a line for what is no number."""
+    """Unset or not ours; a text in place of a number is logged."""
     sender, clock = notifier(socket_end, **more)
     for _ in range(3):
         sender.turn(state(True, "fine"))
@@ -171,7 +171,7 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged):
-    """Until then the status has what is missing."""
+    """Until then the status names the missing part."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
     box = rigged(simulated, observers=[turn_log])

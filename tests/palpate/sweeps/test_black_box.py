@@ -1,4 +1,4 @@
-"""The black box: what it keeps, and that its errors never stop the box."""
+"""The black box: the sweeps in it, and that its errors never stop the box."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_last_sweeps_are_kept_over_restarts(tmp_path):
 
 
 def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch):
-    """A sweep is removed after the new one has its name."""
+    """A sweep is removed after the newest has its name."""
     black = box(tmp_path)
     put(black, 1, 2, 3)
     there: list[int] = []

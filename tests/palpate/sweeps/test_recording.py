@@ -172,7 +172,7 @@ def test_a_sidecar_holds_everything(recorded, tmp_path):
 
 
 def test_a_recording_is_a_set_to_train_on(recorded, tmp_path):
-    """`palpate-train --set DIR` reads what the box recorded."""
+    """`palpate-train --set DIR` reads labels and windows of the box."""
     simulated = tubes(3, 2)
     box = recorded(simulated, Labels("wood", "1", "a"))
     box.until(lambda: box.box.answered == 1)
@@ -425,7 +425,7 @@ def test_the_log_says_what_is_missing(tmp_path, logged):
 
 
 def test_a_folder_of_another_format_is_refused(tmp_path):
-    """It stays as it is; a damaged sweep there is no matter."""
+    """It stays as it is, also with a damaged sweep in it."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()

@@ -199,7 +199,7 @@ def test_other_speeds_are_tried_until_one_gives_text(baud):
 
 @pytest.mark.parametrize(("sent", "code"), [(numbers, 0), (lambda i: b"Press any key\n", 69)])
 def test_a_profile_is_written(capsys, tmp_path, monkeypatch, sent, code):
-    """It loads; what is not allowed is refused before the port is opened."""
+    """It loads; wrong names and grids are refused before the port is opened."""
     clock = VirtualClock()
     opened = lambda path, baud, clock: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
     monkeypatch.setattr("palpate.io.serial_link.SerialLink", opened)

@@ -161,7 +161,7 @@ def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
 
 
 def test_an_open_sweep_does_not_wear_the_answer_of_the_last(browser: Any, shown: Shown):
-    """It is small until this one is answered."""
+    """Which is small until the new answer."""
     seen = opened(browser, shown)
     sweep()(shown)
     until(lambda: seen.text("#label") == "wood")
