@@ -40,8 +40,7 @@ def eventually(there: Callable[[], bool]) -> None:
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
-    """Run a bridge in a thread, ten times as fast as a process; yields its address, ("", 0) of a
-    bridge that does not listen."""
+    """Run a bridge in a thread; yields its address, ("", 0) where it does not listen."""
     listen = ("--listen", "127.0.0.1:0") if kind in PORTS else ()
     parser = argparse.ArgumentParser("bridge")
     add_arguments(parser)

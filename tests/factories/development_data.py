@@ -6,9 +6,7 @@ SERIES = "GunPoint, published split"
 
 
 def entry(case: str, method: str, mean: float, **more: Any) -> dict[str, Any]:
-    """An accuracy with an interval of five points each way. `palpate` is in int8; its float
-    accuracy is a point higher.
-    """
+    """An accuracy, five points each way; `palpate` is int8, a point below its float."""
     ends = {"mean": mean, "low": round(mean - 0.05, 4), "high": round(mean + 0.05, 4)}
     ends |= {"n": 100, "seeds": [1, 2]}
     forms = {"float": ends | {"mean": round(mean + 0.01, 4)}} if method == "palpate" else {}

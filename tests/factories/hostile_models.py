@@ -34,8 +34,7 @@ def model(
     last: str = "y",
     opsets: Any = OPSETS,
 ) -> onnx.ModelProto:
-    """A model of these nodes. It reads `sweep` as `x`; the largest number of `last`, twice, is
-    `logits`."""
+    """A model of these nodes from `sweep` as `x`; the largest of `last`, twice, is `logits`."""
     ends = [
         node("Reshape", [last, "flat"], ["row"]),
         node("ReduceMax", ["row"], ["most"], axes=[1]),
@@ -139,8 +138,7 @@ def foreign() -> Models:
 
 
 def endless() -> Models:
-    """Models with control flow. onnxruntime opens the loop that waits for a sweep and runs golden
-    sweeps; the first sweep with a count of 255 never ends."""
+    """Models with control flow, whose first sweep with a count of 255 never ends."""
     true = helper.make_tensor("go", TensorProto.BOOL, [], [True])
     goes_on, inside = node("Identity", ["c"], ["d"]), "attribute: field 6"
     i, c, d = info("i", 7, []), info("c", 9, []), info("d", 9, [])
@@ -254,8 +252,7 @@ def crooked() -> Models:
 
 
 def dangerous() -> Models:
-    """Models whose numbers make onnxruntime divide by zero or read beside an array, and models with
-    sizes that depend on the sweep."""
+    """Models that divide by zero, read beside an array, or size by the sweep."""
 
     def integers(kind: str, inputs: str, held: Mapping[str, Any] = {}, **how: Any) -> Any:
         """The node between casts of the sweep to integers and back."""

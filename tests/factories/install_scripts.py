@@ -60,10 +60,7 @@ def _server() -> subprocess.Popen[str]:
 
 
 def run_here(code: str) -> str:
-    """Output of Python code that imports the scripts, in a process of its own.
-
-    Importing gevent here would change this process too much.
-    """
+    """Output of code that imports the scripts, in a process: gevent changes it too much."""
     server = _server()
     assert server.stdin
     assert server.stdout

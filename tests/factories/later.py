@@ -5,10 +5,7 @@ from typing import Any
 
 
 class Later:
-    """A module that is imported at its first use, not when the tests are collected.
-
-    A test patches it by its full name.
-    """
+    """A module that is imported at its first use; patch it by its full name."""
 
     def __init__(self, name: str) -> None:
         vars(self)["module"] = name

@@ -86,8 +86,7 @@ def plugin() -> ModuleType:
 
 
 class PlayedFeed:
-    """A box's feed at `path`. It greets each reader with `greeting`, and says the lines of the
-    test. asked: the requests of readers."""
+    """A box's feed at `path`: `greeting`, then the test's lines. asked: requests."""
 
     def __init__(self, path: Path, *greeting: Mapping[str, Any]) -> None:
         self.asked: list[dict[str, Any]] = []

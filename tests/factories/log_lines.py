@@ -1,6 +1,4 @@
-"""The log of the box while a block runs: one text a line, warnings after `<4>` as in systemd's
-journal.
-"""
+"""The log of the box while a block runs, warnings after `<4>` as in the journal."""
 
 import logging
 from collections.abc import Iterator

@@ -1,6 +1,4 @@
-"""A model that needs no training, its method, and sweeps of its two materials, one of them
-louder.
-"""
+"""A model that needs no training, its method, and sweeps of its two materials."""
 
 from dataclasses import dataclass, field
 

@@ -119,10 +119,7 @@ def _pip(*args: str) -> tuple[str, ...]:
 
 
 def _group() -> Path | None:
-    """A new control group, or None on a machine without control groups.
-
-    In a shared group the systemd of a container would end the programs of another container.
-    """
+    """A new control group or None; in a shared one containers would end each other's programs."""
     mounts = (line.split() for line in Path("/proc/mounts").read_text().splitlines())
     mounted = next((Path(where) for _, where, kind, *_ in mounts if kind == "cgroup2"), None)
     return Path(tempfile.mkdtemp(prefix="palpate-", dir=mounted)) if mounted else None
@@ -308,9 +305,7 @@ class Service:
 
 
 def pack(parcel: Path, source: Path) -> None:
-    """Put the wheel of this checkout and systemd/ into a parcel. source: an empty folder to build
-    in.
-    """
+    """Put the wheel of this checkout and systemd/ into a parcel. source: an empty folder."""
     wheel(parcel, source)
     for name in PLACES:
         shutil.copy(ROOT / "systemd" / name, parcel)

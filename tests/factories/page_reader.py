@@ -11,8 +11,7 @@ ELSEWHERE = re.compile(r"@import|url\((?!#)|<link")
 
 
 class PageReader(HTMLParser):
-    """The page. `text` becomes its visible text with single spaces. faults: tags that are not
-    closed in order, values that are missing, style sheets and fonts of other files."""
+    """A page's visible `text`; faults: open tags, missing values, other files."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

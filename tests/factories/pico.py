@@ -1,7 +1,4 @@
-"""The firmware of firmware_config/pico for tests.
-
-Its pure module runs in this Python, all of it under MicroPython.
-"""
+"""The firmware of firmware_config/pico: its pure module here, all of it in MicroPython."""
 
 import json
 import platform

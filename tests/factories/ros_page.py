@@ -1,7 +1,4 @@
-"""Runs a program of docs/robots/ros2.md four times and prints each result as a JSON line.
-
-The program comes on stdin. Arguments: its class, and the arguments of `classify` as JSON.
-"""
+"""Run a program (stdin) of ros2.md four times, a JSON line each; class, arguments as JSON."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A second ROS 2 node as a process: prints its messages as JSON lines, makes the calls from stdin.
-
-It runs in a Python with rclpy and imports nothing of the project.
-"""
+"""A second ROS 2 node: messages as JSON lines, calls from stdin; nothing of the project."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A board of PROTOCOL.md on a pseudo-terminal: requests are bytes, replies are packets.
-
-A board of the rig answers in a thread of this process.
-"""
+"""A board of PROTOCOL.md on a pseudo-terminal, answered in a thread of this process."""
 
 import os
 import select

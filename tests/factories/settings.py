@@ -11,10 +11,7 @@ NO_FILE = Path("/dev/null")
 
 
 def load(sets: Iterable[str] = (), board: str | None = None) -> Config:
-    """The settings of this checkout with "section.key=value" of `sets`.
-
-    `sets` may also name the constants beside the settings (`schema.fixed`).
-    """
+    """The settings of this checkout with "section.key=value", `schema.fixed` included."""
     constants, known = [], []
     fixed = fixed_names()
     for text in sets:

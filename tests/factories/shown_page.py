@@ -23,8 +23,7 @@ def four_hours_ago() -> str:
 
 
 class Shown:
-    """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
-    second whether there is a box, as with the command, however slow the machine is."""
+    """A page whose lines a test writes; within `with` browsers learn fast of a lost box."""
 
     def __init__(self, access: Access, finger: str = "", memory: Path = NO_FILE) -> None:
         self.history, self.boxes = History(memory, four_hours_ago()), list[dict[str, str]]()
@@ -73,8 +72,7 @@ class Shown:
             self.history.take(line, round(NOW_S * feed_lines.SECOND))
 
     def shift(self) -> None:
-        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of
-        the last twenty."""
+        """A box at work: forty sweeps, one `moved`, some without a label, twenty signals."""
         self.board.take(feed_lines.hello())
         for number in range(1, 41):
             status = {5: "unsure", 11: "gap", 17: "unsure", 23: "no-contact"}.get(number, "ok")

@@ -1,6 +1,4 @@
-"""A box on simulated devices: numbered frames, devices with an idle robot, the robot's serial
-port.
-"""
+"""A box on simulated devices: numbered frames, an idle robot, the robot's port."""
 
 import os
 import select

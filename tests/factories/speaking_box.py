@@ -59,10 +59,7 @@ def obeying(heard: Sentence) -> list[bytes]:
 
 
 class SpeakingBox:
-    """Answers each command as the script says, and sends the sentences of the test.
-
-    path: the robot's end; `unplug` removes it, `plug_in` brings it back. heard: the commands.
-    """
+    """Answers by script at `path`; `unplug`, `plug_in`; heard: the commands."""
 
     def __init__(self, path: Path, script: Script = obeying) -> None:
         self.path, self.script = path, script

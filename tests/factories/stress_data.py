@@ -1,5 +1,4 @@
-"""Invented results of the study stress: six methods and a bundle under three corruptions, and
-under two pairs of them."""
+"""Invented results of the study stress: six methods and a bundle, three corruptions."""
 
 from typing import Any
 
@@ -30,9 +29,7 @@ BOX = {
 
 
 def figures() -> dict[str, Any]:
-    """Results of 100 sweeps and one seed. `quant` refused the set. The first method is the
-    project's.
-    """
+    """100 sweeps, one seed; `quant` refused the set; the first method is ours."""
     tasks = [task(name, right) for name, right in METHODS.items()]
     refused = {"method": "quant", "seed": 1, "set": "x", "refused": "needs aeon"}
     methods = robustness.merge([*tasks, refused])["methods"]

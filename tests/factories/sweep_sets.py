@@ -42,9 +42,7 @@ def write(path: Path, **changes: object) -> str:
 def tones(
     recordings: int = 6, windows: int = 2, noise: float = 1.0, offset: float = 0.0
 ) -> Dataset:
-    """Three materials that hum at 5, 11 and 23 Hz on a 2 x 1 skin at 100 Hz; `offset` distinguishes
-    a material by its mean.
-    """
+    """Three hums (5, 11, 23 Hz) on 2 x 1 taxels at 100 Hz; `offset`: told by the mean."""
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(3), recordings * windows)
     recording = np.arange(len(labels)) // windows

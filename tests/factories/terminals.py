@@ -1,8 +1,4 @@
-"""Reads a program on a terminal.
-
-On failure an AssertionError contains the text so far, and the process is killed, so no test waits
-for it forever.
-"""
+"""Reads a program on a terminal; a failure has its text and kills the process."""
 
 import os
 import select

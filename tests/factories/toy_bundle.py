@@ -39,10 +39,7 @@ OUTPUTS = ("logits", "embedding")
 
 
 def window(z1: float, z2: float, format: SweepFormat = FORMAT) -> np.ndarray:
-    """Raw counts [T, R, C] with the embedding (z1, z2), in tenths.
-
-    Every taxel is loaded and vibrates. The shear is a tenth of the normal load.
-    """
+    """Raw counts [T, R, C] with the embedding in tenths; shear is a tenth of the load."""
     level = np.full((format.rows, format.cols), 100.0)
     level[0, :2] += 10 * z1, 10 * z2
     ripple = np.where(np.arange(format.window) % 2, 1, -1)[:, None, None]
@@ -78,9 +75,7 @@ def model(
     scale: float = 0.1,
     labels: int = 3,
 ) -> bytes:
-    """The graph. Each early row d is (d + 1) times the logits, each row of early_embedding the
-    embedding. Further outputs are copies of the logits.
-    """
+    """The graph: row d of early heads is (d + 1) times the logits; extras are copies."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     node, array = onnx.helper.make_node, onnx.numpy_helper.from_array
     values = format.rows * format.cols * format.axes
@@ -150,8 +145,7 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def early_arrays(steps: int = 3) -> dict[str, np.ndarray]:
-    """Further arrays of means.npz, for unfinished sweeps: at each step the materials lie where they
-    do at the end, with variance 1."""
+    """Arrays of means.npz for unfinished sweeps: as at the end, variance 1."""
     return {
         "early_means": np.tile(MEANS, (steps, 1, 1)),
         "early_shapes": np.tile(np.eye(2, dtype=np.float16), (steps, 1, 1)),

@@ -13,10 +13,7 @@ FORMAT = SweepFormat(2, 2, 100.0, 163, "int16")
 
 
 def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:
-    """A graph from `sweep` to the taxels' means over the window, `features` [1, F].
-
-    prefixes: instead the means over the first tenths of the window, `tenths` [1, 10, F].
-    """
+    """Means over the window, `features` [1, F]; prefixes: over tenths, [1, 10, F]."""
     g, taxels, length = GraphBuilder(), format.rows * format.cols, format.window // 10
     x = g("Cast", g("Reshape", "sweep", g.constant([format.window, taxels], "int64")), to=1)
     x = g("Slice", x, g.constant([0], "int64"), g.constant([10 * length], "int64"))
@@ -43,8 +40,7 @@ def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:
 def view(
     format: SweepFormat, nodes: Callable[..., str], size: int, samples: np.ndarray, prefixes: bool
 ) -> np.ndarray:
-    """The features [n, size] of raw counts, or [n, PREFIXES, size], by a graph of one view alone.
-    nodes: takes the graph, its counts [1, T, M] and the factors of taxels; gives the features."""
+    """Features [n, size] or [n, PREFIXES, size] of counts by a graph's `nodes` alone."""
     g, shape = GraphBuilder(), (PREFIXES, size) if prefixes else (size,)
     raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
     found = nodes(g, raw, g.constant(np.ones((1, 1, format.channels))))

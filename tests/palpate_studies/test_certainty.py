@@ -1,6 +1,4 @@
-"""The study `certainty`: figures on Gaussians with known true values, and the command from set to
-page.
-"""
+"""The study `certainty`: figures on Gaussians with known values, and its command."""
 
 import json
 import re

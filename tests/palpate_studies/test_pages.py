@@ -41,8 +41,7 @@ def name(path: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", HTML)
 def test_a_page_is_sound(drawn: Path, page: str):
-    """Its tags close, no value is missing, it needs no other file, and its header is that of its
-    results; if these are of another default, the first line says so."""
+    """Tags close, nothing is missing; its header, or its first line, says the default."""
     text = (drawn / page).read_text()
     read = PageReader(text)
     assert read.faults == []
@@ -152,8 +151,7 @@ def readable(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 def test_a_page_can_be_read(
     browser: Any, readable: dict[str, Path], page: str, width: int, scheme: str
 ):
-    """On a phone, a tablet and a desk, light and dark, nothing is cut off, every axis has a title,
-    contrast is at least 4.5, tables have heads and take the focus if they scroll."""
+    """At three sizes nothing is cut, contrast is 4.5, axes and tables have heads."""
     assert rendered.faults(browser, rendered.address(readable[page]), width, scheme) == {}
 
 

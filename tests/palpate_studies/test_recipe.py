@@ -115,8 +115,7 @@ class LoadsFits:
 
 @pytest.mark.slow
 def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
-    """Each world has a skin that was put back and positions left out; a fit without loads stands
-    beside each fit that chose them, and the answers of all positions are counted together."""
+    """A fit without loads beside each that chose them."""
     fits = LoadsFits(monkeypatch, chosen=True)
     monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
     found = list(loads_table.rows(lambda line: None))

@@ -1,5 +1,4 @@
-"""The command line of the box with emulators of makers' skins: `python -m
-tests.factories.skins.command record --sim skin --skin flexitac ...`."""
+"""The box's command line with makers' skins: `... record --sim skin --skin flexitac`."""
 
 import argparse
 import sys

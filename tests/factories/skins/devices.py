@@ -1,5 +1,4 @@
-"""A simulated robot whose skin is an emulated skin on a terminal, built from the name of its
-profile and acts."""
+"""A simulated robot whose skin is an emulated one on a terminal."""
 
 import tempfile
 from collections.abc import Callable, Iterable
@@ -21,8 +20,7 @@ from tests.factories.skins.wires import wire
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedDevices(RobotDevices):
-    """Simulated GPIO lines, and a skin that is played on a terminal. name: of its profile. folder:
-    where the terminal's link is; removed with this object."""
+    """Simulated GPIO lines and a played skin; its link in `folder` goes with it."""
 
     name: str
     player: Player

@@ -214,11 +214,7 @@ PORT_BYTES = 4000
 
 
 class PlayerClock:
-    """A clock whose waits play a skin, so that no bytes are missed while the box sleeps, in real
-    and in simulated time.
-
-    player: the skin; set before the box runs.
-    """
+    """A clock whose waits play `skin`, so that no bytes are missed meanwhile."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

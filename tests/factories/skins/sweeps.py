@@ -107,10 +107,7 @@ def _at(values: Array, at: Array) -> Array:
 
 
 def view(name: str, format: SweepFormat) -> SkinView:
-    """The simulated finger with the skin of the profile `name`, which has this format.
-
-    Raises FormatError for two axes or more than three.
-    """
+    """The simulated finger with a profile's skin. Raises FormatError for 2 or over 3 axes."""
     if format.axes not in (1, 3):
         raise FormatError(
             f"the simulated finger is felt with 1 or 3 axes, not {format.axes}; use another profile"

@@ -182,9 +182,7 @@ def test_auroc_of_a_known_separation():
 
 
 def test_untrained_features_are_selected_and_not_multiplied():
-    """If there are more features than directions, the projection is that of all features, from a
-    matrix for the trained ones alone: the covariance of z is 1, and the last features alone decide
-    in their own span."""
+    """Covariance 1; the last features decide in their own span."""
     mix = np.random.default_rng(1).standard_normal((20, 20))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)) @ mix, mix=mix)
     one = embedding.embed(x, y, 5)
@@ -199,8 +197,7 @@ def test_untrained_features_are_selected_and_not_multiplied():
 
 
 def test_two_sweeps_of_each_material_do_not_make_the_next_infinitely_far():
-    """The next sweep lies within some hundred times the mean of the learned ones, not 10^9 times:
-    two sweeps alone show no noise of their covariance."""
+    """Some hundred times the mean at most."""
     rng = np.random.default_rng(3)
     means, labels = 5 * rng.standard_normal((3, 200)), np.repeat(np.arange(3), 2)
     learned, new = (means[labels] + rng.standard_normal((6, 200)) for _ in range(2))

@@ -158,8 +158,7 @@ def test_a_material_of_one_place_and_two_materials():
 
 @pytest.fixture(scope="module")
 def made():
-    """The parts of a bundle on the toy trunk, which has one untrained feature: Calibration,
-    features, raw counts, labels, Bundle."""
+    """A bundle on the toy trunk: Calibration, features, raw counts, labels, Bundle."""
     rng = np.random.default_rng(0)
     labels = np.tile(np.repeat(np.arange(3), 4), 6)
     level = np.array([[[20, 60], [40, 40]], [[60, 20], [40, 40]], [[40, 40], [60, 20]]])

@@ -164,8 +164,7 @@ def test_skins_and_sets_that_show_no_modes(shape: tuple[int, ...]):
 
 @pytest.mark.slow
 def test_the_packaged_bundle_bridges_what_its_manifest_says():
-    """Dead taxels in new sweeps: none is refused, and at most one of twelve loses its label. The
-    limit of known materials is the loose one, so that it does not hide what bridging does."""
+    """None is refused, one of twelve loses its label."""
     packaged = bundle.load(bundle.DEFAULT)
     assert packaged.manifest.bridging
     box = Classifier(packaged, SystemClock(), strangers="loose")

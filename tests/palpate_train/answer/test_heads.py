@@ -50,8 +50,7 @@ def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
 
 @pytest.mark.parametrize(("n", "size"), [(60, 10), (40, 200)])
 def test_values_of_a_condition_widen_the_scatter_to_one_more(n: int, size: int):
-    """The covariance has the squares of the means of each value 2 / (G - 1) times more, of G
-    values; a material under one value adds none. The shrinkage is that of the sweeps alone."""
+    """Squares of the means 2 / (G - 1) times more."""
     x, labels = drawn(n, size)
     under = np.where(labels == 0, 5, np.random.default_rng(3).integers(0, 3, n))
     means = np.stack([x[labels == k].mean(axis=0) for k in range(4)])
@@ -73,8 +72,7 @@ def test_values_of_a_condition_widen_the_scatter_to_one_more(n: int, size: int):
 
 
 def test_a_feature_that_moves_with_a_condition_counts_less():
-    """Two features name three materials alike; one of them moves with the force. One more force
-    would move it again, so its weight is less than the sweeps alone say."""
+    """Another force would move it again."""
     rng = np.random.default_rng(1)
     labels, force = np.arange(240) % 3, np.arange(240) // 3 % 2
     x = rng.standard_normal((240, 4))
@@ -143,8 +141,7 @@ def test_one_sweep_of_each_material_is_too_few():
 
 @pytest.mark.parametrize("size", [10, 200])
 def test_weights_count_for_means_and_scatter(size: int):
-    """A weight of 0 is as if the sweep was not there, equal weights change nothing, and means are
-    weighted."""
+    """0 is as if absent, equal weights change nothing."""
     x, labels = drawn(60, size)
     under = (np.arange(60) % 3)[:, None]
     kept = np.arange(60) % 5 > 0

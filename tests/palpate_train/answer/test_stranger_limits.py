@@ -20,8 +20,7 @@ MATERIALS = 4
 def left_out(
     n: int = 60, seed: int = 0, apart: float = 2.0, inflated: float = 0.0, parts: int = 5
 ) -> LeftOut:
-    """Known and unknown sweeps of MATERIALS whose logarithms lie `apart`, both `inflated` against
-    the finished model."""
+    """Known and unknown sweeps whose logarithms lie `apart`, `inflated` against the model."""
     rng = np.random.default_rng(seed)
     labels, values = np.arange(n) % MATERIALS, np.arange(n) // MATERIALS % parts
     known, strangers = rng.normal(0.0, 0.5, (2, n))
@@ -62,8 +61,7 @@ def test_few_sweeps_promise_no_more_than_they_show(each: int, seed: int):
 
 @pytest.mark.parametrize("parts", [2, 3, 10])
 def test_a_cross_fit_is_corrected_for_what_it_lacks(parts: int):
-    """The limits for inflated distances are lower by all of the inflation with two parts, and by
-    less with more."""
+    """By all of the inflation with two parts, else by less."""
     inflated, plain = left_out(inflated=1.5, parts=parts), left_out(parts=parts)
     known = [one.corrected()[0] for one in (inflated, plain)]
     np.testing.assert_allclose(known[0] - known[1], 1.5 - 1.5 / (parts - 1), atol=1e-9)
@@ -91,8 +89,7 @@ def test_all_conditions_count():
 
 
 def test_a_new_sweep_is_not_nearer_than_a_learned_one():
-    """A cross-fit of two parts inflates distances. The limit still contains nearly all sweeps of
-    the finished model's training, where these lie far."""
+    """The limit holds nearly all sweeps of the training."""
     inflated = left_out(inflated=2.0, parts=2)
     far = replace(inflated, learned=inflated.known * 0.8)
     assert np.mean(far.learned <= limits({"force": far}).loose) > 0.98

@@ -24,8 +24,7 @@ from tests.factories.sweep_sets import easy
 
 @pytest.mark.slow
 def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """fit writes the sweeps that it did not train on as a set. Recordings stay whole, and training,
-    held-out and written sweeps together are the whole set."""
+    """Whole recordings; training, held-out and written are all."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
     args = f"fit --set {tmp_path / 'easy.npz'} --seed 1 --stages 4 --only speed<=2".split()
     args += (
@@ -294,8 +293,7 @@ def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureF
     ],
 )
 def test_a_fit_tells_its_worst_value(group: str, wrong: int | None, told: list[str]):
-    """Of each condition, unless all are classified correctly; what lies beyond an outermost one is
-    not known. Positions and names have no order."""
+    """Of each condition, unless all are right; names have no order."""
     values = np.repeat([1, 2, 3], 8)
     held = easy(8)
     held = replace(held, units={"speed": "mm/s"} if group == "speed" else {})

@@ -29,8 +29,7 @@ EVIL = "\x1b[2J\n\x9b1mtaken: 9 files\u202e"
 
 
 def test_names_of_files_forge_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Escape sequences and line breaks in names, of files that are taken, left out and refused:
-    the terminal, the report and the description of the set show each as one printable line."""
+    """Escape sequences and line breaks are shown as one printable line."""
     folder, report = tmp_path / "recordings", tmp_path / "report.txt"
     folder.mkdir()
     for name in ("wood_1", f"wool_{EVIL}", f"broken_{EVIL}", EVIL):
@@ -55,8 +54,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ):
-    """The commands of the page on simulated sweeps written as CSV: the sweeps come back, most of
-    the rest get the right label, and no library prints anything."""
+    """Sweeps come back, most labels are right."""
     monkeypatch.chdir(tmp_path)
     folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
     assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
@@ -267,8 +265,7 @@ TABLE = (
 
 
 def test_labels_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """By path or name; a file that the table lacks, the table itself and a missing file are left
-    out, of which the last is a fault. A pattern may give other fields."""
+    """By path or name; what it lacks is left out, a missing file is a fault."""
     for name in ("a/1", "b/2", "b/3", "b/4"):
         counts = np.random.default_rng(int(name[-1])).integers(0, 99, (30, 4))
         (tmp_path / name).parent.mkdir(exist_ok=True)

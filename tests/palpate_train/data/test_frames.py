@@ -318,8 +318,7 @@ def test_a_taxel_with_other_times_is_refused(late: float, refused: bool):
 
 
 def test_facts_about_a_recording_are_fields(tmp_path: Path):
-    """Attributes and single values of HDF5, from the file down to the array, as robomimic keeps
-    them. No link is followed. JSON has facts beside its frames."""
+    """Attributes and single values, from file to array; no link."""
     x = cube(2, 2, 40)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["secret"] = "far"

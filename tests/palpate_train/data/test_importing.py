@@ -184,8 +184,7 @@ def test_no_window_goes_over_a_gap(tmp_path: Path):
 def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
     tmp_path: Path, dtype: str, recorded: str | type, expected: str
 ):
-    """Types that the box knows stay, in this machine's byte order; others become the first type
-    that holds every count; --dtype overrides."""
+    """In this machine's order; --dtype wins."""
     both(tmp_path, lambda path: np.save(path, COUNTS.astype(recorded)), "npy")
     samples = taken(tmp_path, dtype=dtype).sweeps.samples
     assert samples.dtype == expected
@@ -350,8 +349,7 @@ def test_axes_are_the_last_of_a_frame(tmp_path: Path):
 
 
 def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
-    """The import goes on and proposes an ASCII name that no other material has. The set keeps the
-    name of the file, in .npz and HDF5; two that become one material have no display name."""
+    """With an ASCII label that no other material has."""
     names = ("felt", "Filz, weiß", "Filz weiss", "木", "x" * 30, "a,b")
     for k, name in enumerate(names):
         text(tmp_path / "in" / f"{name}_1.csv", COUNTS + k)
@@ -461,8 +459,7 @@ def test_patterns_of_arrays_that_cannot_be(variable: str, pattern: str | None, m
 
 
 def test_a_square_grid_of_hdf5_may_have_its_axes_reversed(tmp_path: Path):
-    """MATLAB's h5write leaves no sign of itself, so the import says how to turn the frames. With
-    --axes, and for an array that MATLAB itself saved, nothing is open."""
+    """Said, unless --axes or MATLAB itself settles it."""
     frames = np.arange(640, dtype=np.int16).reshape(40, 4, 4)
     for name, kind in (("felt_1", None), ("wool_1", b"int16")):
         with h5py.File(tmp_path / f"{name}.h5", "w") as file:

@@ -1,5 +1,4 @@
-"""LeRobot data sets: episodes become recordings, tasks become materials; versions 2.1 and 3.0.
-Sets are written as version 3.0, and LeRobot reads them where it is installed."""
+"""LeRobot sets 2.1 and 3.0: episodes become recordings, tasks materials; 3.0 is written."""
 
 import json
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Means and deviations of float32 counts over many frames: float32 alone adds row after row, and
-the mean of half an hour at 50,000 counts would be off by 600."""
+"""Means of float32 counts over many frames, which float32 alone would get wrong by 600."""
 
 from collections.abc import Callable
 from typing import Any

@@ -79,8 +79,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def counts(capsys: pytest.CaptureFixture[str], *names: str) -> list[int]:
-    """The numbers of recordings fetched, there already and refused, as printed in the first line;
-    `names` are printed below it."""
+    """Numbers of recordings fetched, there already and refused; `names` are printed below."""
     first, _, rest = capsys.readouterr().out.partition("\n")
     assert all(name in rest for name in names)
     return [int(word) for word in re.findall(r"\d+", first)]

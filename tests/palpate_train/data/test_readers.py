@@ -396,8 +396,7 @@ def test_a_folder_of_sets_names_them(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.data", "folder"])
 def test_what_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
-    """The message gives the cause, before a library fails on a file with its own words, and instead
-    of claiming that a folder is empty."""
+    """Before a library's own words, or a claim of an empty folder."""
     (tmp_path / "folder").mkdir()
     Path(write(tmp_path / "b.npz")).rename(tmp_path / ("c" if name == "folder" else name))
 
@@ -411,8 +410,7 @@ def test_what_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -> np.ndarray:
-    """Record sweeps by name with the given level of the unloaded skin, None if it was not noted;
-    returns the pressure that all have, [8, 2, 3]."""
+    """Record sweeps with these levels (None: not noted); the pressure of all, [8, 2, 3]."""
     format, pressed = replace(FORMAT, dtype=dtype), np.arange(48).reshape(8, 2, 3) % 7 + 20
     folder.mkdir(exist_ok=True)
     for name, level in levels.items():

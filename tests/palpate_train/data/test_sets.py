@@ -310,8 +310,7 @@ def test_conditions_speak_of_values(condition: str, kept: int):
 
 
 def test_sets_are_joined_by_values():
-    """Names stay together over sets, and so do positions that have names; units are converted; if
-    one set has names, all become names. Units of different kinds are refused."""
+    """Names stay together, units are converted, different kinds are refused."""
     one = grouped(speed=["fast", "slow"] * 6, force__mN=[300, 1500] * 6, position=["tip"] * 12)
     two = grouped(speed=["medium", "slow"] * 6, force__N=[0.3, 2.0] * 6, position=["tip"] * 12)
     both = sets.join([one, two])
@@ -358,8 +357,7 @@ def test_without_means_leaves_the_texture(dtype: str):
 
 @pytest.mark.parametrize("name", ["s.npz", "s.h5"])
 def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
-    """It is in files of both formats, in parts and in joined sets, where it is unknown for the
-    sweeps of a set without it; it changes the digest. A set without means has none."""
+    """In both formats, parts and joined sets; not without means."""
     known = 0.1 * np.random.default_rng(1).random((12, 2, 2, 2))  # differences smaller than a load
     s = replace(easy(4), unloaded=known)
     s.save(tmp_path / name)

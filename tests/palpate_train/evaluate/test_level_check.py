@@ -55,8 +55,7 @@ def with_levels(sweeps: Dataset, level: np.ndarray) -> Dataset:
 @pytest.mark.parametrize("dtype", ["int16", "uint16", "float32"])
 @pytest.mark.parametrize("windows", [1, 2])
 def test_a_level_that_the_session_sets_is_reported(dtype: str, windows: int):
-    """One line for the session with both accuracies and chance; none for a group that the level
-    does not depend on. Data type and windows of a recording do not matter."""
+    """Both accuracies and chance; no line for other groups."""
     sweeps = leveled(True, windows=windows, dtype=dtype)
     sweeps.groups["speed"] = sweeps.groups["recording"] % 2
     check_sessions(level_check.warnings_of(sweeps))
@@ -71,8 +70,7 @@ def test_a_taxel_may_have_three_axes():
 
 
 def test_a_level_that_names_the_material_everywhere_is_counted():
-    """The level names the materials across sessions and speeds too: one line, with the count. It
-    names them nowhere: no line."""
+    """Across sessions too: the count; else no line."""
     sweeps = leveled(False)
     sweeps.groups["speed"] = sweeps.groups["recording"] % 2
     (line,) = level_check.warnings_of(sweeps)
@@ -82,16 +80,14 @@ def test_a_level_that_names_the_material_everywhere_is_counted():
 
 
 def test_a_level_that_helps_across_sessions_is_not_reported():
-    """The level names 100 % within sessions and 75 % across them, since one session of three is
-    moved by most of a material's distance: it depends on both, so no line blames the session."""
+    """100 % within and 75 % across: both matter."""
     sweeps = leveled(False)
     moved = 100 * sweeps.labels + 75 * (sweeps.groups["session"] == 2)
     assert not any(map(SESSIONS.fullmatch, level_check.warnings_of(with_levels(sweeps, moved))))
 
 
 def test_sets_of_one_session_have_a_line_of_their_own():
-    """No group, or groups of one value: recorded in one session. Sessions of one material each
-    cannot be left out. A level that names nothing has no line."""
+    """Also of one material each; no level, no line."""
     one = leveled(False, sessions=1)
     bare = replace(one, groups={})
     apart = replace(one, groups={"session": one.labels})
@@ -104,8 +100,7 @@ def test_sets_of_one_session_have_a_line_of_their_own():
 
 
 def test_recordings_stay_whole():
-    """If each recording has levels of its own, its windows would reveal each other: there is a line
-    only if the set does not say which windows belong to a recording."""
+    """Levels of their own would reveal windows: a line if recordings are unknown."""
     sweeps = leveled(False, windows=6, sessions=1)
     own = np.random.default_rng(3).uniform(0, 400, (32, 1, 6, 6))[sweeps.groups["recording"]]
     noise = np.random.default_rng(4).normal(0, 4, (len(own), 6, 6, 6))
@@ -115,8 +110,7 @@ def test_recordings_stay_whole():
 
 
 def test_answers_are_materials_of_the_session():
-    """Each session holds two of the materials, so chance is 50 %. Equal levels of materials that
-    never meet in a session do not lower the accuracy across sessions."""
+    """Chance is 50 %; materials that never meet do not count."""
     whole = leveled(True, each=12, sessions=6)
     sweeps = whole.take((whole.labels - whole.groups["session"]) % 2 == 0)
     rank, turn = sweeps.labels // 2, sweeps.groups["session"] // 2
@@ -207,8 +201,7 @@ def test_many_values_are_drawn():
 
 @pytest.mark.slow
 def test_the_commands_print_the_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`sets describe` prints it below the set, of a file and of a folder; every command that loads
-    sets, `fit` among them, prints it as a warning, of the sweeps that --only keeps."""
+    """`sets describe` below the set; others warn, of what --only keeps."""
     file = tmp_path / "set.npz"
     leveled(True).save(file)
     for session, material, i in np.ndindex(3, 4, 8):

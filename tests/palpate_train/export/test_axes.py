@@ -34,9 +34,7 @@ def test_from_a_set_to_the_answers_of_the_box(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
-    """After fit and export by command, unseen sweeps over the wire get the labels that the bundle
-    gives on the desktop, and again when they are replayed; positions are those of the normal
-    axis."""
+    """By command, over the wire, and replayed, as on the desktop."""
     sheared().save(tmp_path / "set.npz")
     fit, out = str(tmp_path / "fit.npz"), tmp_path / "bundle"
     assert (

@@ -83,8 +83,7 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_golden_sweeps_are_rounded():
-    """Steps are at most COARSEST usual changes. The file is smaller, its logits are those of the
-    rounded sweeps, and their probabilities are near those of the exact ones."""
+    """To COARSEST usual changes: smaller, and probabilities stay near."""
     content = trained("L-gauss", tones())
     rng = np.random.default_rng(1)
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)

@@ -191,8 +191,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 
 
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
-    """With the distance of the taxels the bundle has contact positions and a rule for displaced
-    sweeps; without it the box could not recognise these, and the file has no arrays for them."""
+    """The distance of taxels gives it; else no arrays for it."""
     export(fitted, tmp_path / "placed", pitch_mm=4.0, asked=Asked(("displacement",)))
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
     assert placed.manifest.contact
@@ -230,8 +229,7 @@ def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
 def test_the_same_fit_gives_the_same_bytes(
     fitted: Fit, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Every file is the same, the zip of golden sweeps included; also from the file of the fit,
-    which keeps calibration and contacts, so that export finds neither again."""
+    """Also from the file of the fit, which keeps what was found."""
     fitted.save(tmp_path / "fit.npz")
     monkeypatch.setattr(quantized_bundle, "finished", None)
     for made in (fitted, Fit.load(tmp_path / "fit.npz")):
@@ -453,9 +451,7 @@ def test_the_default_bundle_is_what_the_box_needs():
 @pytest.mark.thorough  # exports every reference
 @pytest.mark.filterwarnings("error")
 def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give
-    six logits. No library logs anything while they are made, about a bias that stays in float, for
-    instance."""
+    """The paper's number of parameters, six logits, no log."""
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
     assert study(["references", "--out", str(tmp_path / "new")]) == 0
@@ -480,8 +476,7 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
 def test_the_command_exports_what_fit_wrote(
     fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """It prints one line for each figure and each rule, two for the cost of its limits, then the
-    size, at last the command to score it; another file has the exit code of FormatError."""
+    """A line a figure and rule, then size and the next command."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     args += ["--stranger-cost", "2"]
@@ -511,8 +506,7 @@ def test_the_command_exports_what_fit_wrote(
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
-    """Nothing in it is int8: both precisions are equal, the labels of box and fit agree, and no
-    tensor is reported. A spoilt head is reported here as well."""
+    """Nothing is int8: both are equal; a spoilt head is seen."""
     made = recipe.fit(easy(), Run(1), recipe.Settings(size=SIZES["bands"]))
     export(made, tmp_path / "b")
     it = box(tmp_path / "b")
@@ -546,9 +540,7 @@ def test_any_method_is_judged_by_the_same_limits(tmp_path: Path, monkeypatch: py
     "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
 )
 def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) with the same commands. Unseen sweeps go
-    over the USB wire into sentences, with materials in turn, so that nearly each is another object;
-    as many are right as by the classifier itself."""
+    """Another skin, same commands: over the wire as right as the classifier."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
     args = f"--set {path} --only direction=0 --only force<=180 --seed 1 --stages 300".split()
     args += (

@@ -67,8 +67,7 @@ def test_a_rule_is_dropped_kept_or_forced(
     out: set[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """A rule stays if it saves half a point of copies or refuses any junk, or if it was asked
-    for. The card has a line for each."""
+    """Half a point of copies, any junk, or a wish keeps it."""
     monkeypatch.setattr(trial, "EACH", 6)
     monkeypatch.setattr(trial, "_counted", counts(needed, junk_needs))
     monkeypatch.setattr(trial, "LEAST", 1 / 300)
@@ -148,8 +147,7 @@ def test_score_shows_the_difference(capsys: pytest.CaptureFixture[str], tmp_path
 
 
 def test_early_answers_are_measured_as_the_box_gives_them():
-    """Slides need part of the window. A bundle that is never sure needs all of it, and its junk
-    gets the labels of whole sweeps; the card says so."""
+    """Part of the window; never sure needs all."""
     made, held_out = bundle.load(bundle.DEFAULT), sets.load(SWEEPS)
     m = made.manifest
     assert m.early

@@ -57,8 +57,7 @@ UNEQUAL = {
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_scikit_learn_accepts_it():
-    """All checks of a classifier and transformer pass but UNEQUAL and the array API's, which is
-    skipped. X is a table there, each row a sweep of one channel."""
+    """All checks pass but UNEQUAL and the skipped array API's."""
     found = estimator_checks.check_estimator(
         library.PalpateClassifier(steps=0, size="64"),
         expected_failed_checks=UNEQUAL,
@@ -74,8 +73,7 @@ def test_scikit_learn_accepts_it():
 def test_a_sweep_that_counts_nothing_changes_no_head(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Sweeps with a wrong label and weight 0: the others are classified as without them, by a
-    bundle too."""
+    """Wrong labels of weight 0, for a bundle too."""
     weights = np.where(np.arange(48) < 12, 0.0, 1.0)
     y = np.where(weights > 0, LABELS, LABELS[::-1])
     one = small().fit(SWEEPS, y, sample_weight=weights)
@@ -108,8 +106,7 @@ def test_parameters_without_a_fit(fitted: PalpateClassifier):
 
 
 def test_labels_and_probabilities(fitted: PalpateClassifier):
-    """New sweeps get the right label; probabilities are in the order of classes_; [n, time, rows,
-    columns] gives the same answers as [n, channels, time]."""
+    """In the order of classes_; both shapes of sweeps are the same."""
     assert fitted.classes_.tolist() == ["felt", "wood"]
     assert fitted.score(SWEEPS[36:], LABELS[36:]) == 1
     found = fitted.predict_proba(SWEEPS[36:])

@@ -15,8 +15,7 @@ PAGE = (ROOT / "docs" / "tutorials" / "library.md").read_text()
 def test_the_code_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Each block prints the result in the text around it; new positions are named well above
-    chance. The call in the text over all positions works, too."""
+    """Each block prints its result; new positions are far above chance."""
     pytest.importorskip("aeon")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "build").mkdir()

@@ -33,8 +33,7 @@ def test_a_calibrated_head_stays_as_it_is():
 
 
 def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
-    """Of 300 sweeps with a margin of 30, one is wrong by a margin of 1: the temperature is a little
-    over half of that with Platt's correction."""
+    """One of 300 wrong by 1: about half."""
     labels = np.arange(300) % 3
     logits = 30 * np.eye(3)[labels]
     logits[0] = [0, 1, 0]

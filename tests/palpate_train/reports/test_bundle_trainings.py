@@ -44,8 +44,7 @@ def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
     [((0.4, 0.2, 0.1), 0.05), ((0.1, 0.1, 0.1), 0), ((0.1, 0.2, 0.3), 0), ((0.0, 0.0, 0.0), 0)],
 )
 def test_what_twice_as_many_sweeps_bring(errors: tuple[float, ...], gain: float):
-    """An error that halves at each doubling halves once more; one that stays or rises brings
-    nothing. The interval holds the gain."""
+    """Halved errors halve once more; the interval holds the gain."""
     points = [{"each": 2.0**i, "share": 1 - e, "n": 1000} for i, e in enumerate(errors)]
     found, low, high = bundle_trainings.doubled(points)
     assert found == pytest.approx(gain, abs=0.001)
@@ -72,8 +71,7 @@ def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
 
 
 def test_materials_are_matched_by_name():
-    """With another order, one more and one less material, labels keep their meaning, and materials
-    without a match are left out. Formats must agree."""
+    """In any order; those without a match are left out."""
     train, other = easy(4), easy(6)
     mixed = replace(other, materials=("high", "felt", "low"))
     found = bundle_trainings.aligned(mixed, train)

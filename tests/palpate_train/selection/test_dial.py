@@ -366,8 +366,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_fits_what_it_chose_and_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A scene and options of the command line together; the fit has the shorter window, and so has
-    the set of --rest. The page loads nothing from elsewhere."""
+    """Fit and --rest have its window; the page is whole."""
     rest = tmp_path / "rest.npz"
     more = ["--size", "pairs", "--reduce", "window", "classes", "--accuracy", "0.8"]
     more += ["--split", "place:0.75", "--rest", str(rest)]

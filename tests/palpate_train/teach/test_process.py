@@ -52,8 +52,7 @@ def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
 
 
 def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
-    """Assessment and fit import neither torch nor scikit-learn nor pandas. The bundle is that of
-    the recipe without stages, names its sweeps, and says who has taught it."""
+    """The recipe's without stages, and who taught it."""
     sweeps = easy(12)
     plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
     lessons.write(tmp_path / "sweeps", plain)

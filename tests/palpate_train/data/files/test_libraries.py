@@ -93,8 +93,7 @@ def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
 
 
 def test_parquet_is_read(tmp_path: Path):
-    """Lists of equal length become columns; empty cells are faults; texts stay; other types are
-    passed over."""
+    """Lists become columns; empty cells are faults; other types are passed over."""
     pa = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     columns: dict[str, Any] = {
@@ -166,8 +165,7 @@ def test_tdms_is_read(tmp_path: Path):
 def bag(
     path: Path, kind: str, messages: str = "sensor_msgs/msg/Image", notes: Sequence[str] = ()
 ) -> Path:
-    """A recording of ROS with a topic of the skin, a topic of texts and one of large images.
-    notes: the texts, "" for none."""
+    """A recording of ROS: the skin, texts (notes, "" for none) and large images."""
     rosbags = pytest.importorskip("rosbags.rosbag2")
     rosbag1 = pytest.importorskip("rosbags.rosbag1")
     from rosbags.typesys import Stores, get_typestore
@@ -209,8 +207,7 @@ def bag(
 @pytest.mark.parametrize("messages", ["sensor_msgs/msg/Image", "std_msgs/msg/Float32MultiArray"])
 @pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
 def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
-    """The topic of the skin, with the times of the headers or of the recording; images of one
-    channel are arrays of their encoding, without the padding of their lines."""
+    """With times of headers or recording; images without their padding."""
     path = bag(tmp_path / ("a.bag" if kind == "bag" else "a"), kind, messages)
     if kind != "bag":
         (path,) = path.glob(f"*.{kind}")

@@ -45,8 +45,7 @@ def written(path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["a.h5", "a.mat", "a.dat"])
 def test_hdf5_has_octaves_order_of_axes(tmp_path: Path, name: str):
-    """Whatever its name; a range is a vector of times, and a structure is walked into.
-    There is no remark on reversed axes."""
+    """Whatever its name; ranges are times; no remark on axes."""
     path = written(tmp_path / name)
     inside = "run.t" if name == "a.mat" else "run/t"
     for time in ("t", inside):
@@ -77,8 +76,7 @@ EXPECTED = {
 @pytest.mark.parametrize("kind", TEXTS)
 @pytest.mark.parametrize("name", ["a.txt", "a.mat"])
 def test_text_has_its_types_and_shapes(tmp_path: Path, kind: str, name: str):
-    """With a range, a name and a complex number in the file; `save a.mat skin` writes text
-    too."""
+    """Also with a range, a name and a complex number in the file."""
     octave, body, dtype = TEXTS[kind]
     path = tmp_path / name
     path.write_text(

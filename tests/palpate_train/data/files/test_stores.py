@@ -43,8 +43,7 @@ def test_a_store_of_both_versions(tmp_path: Path, version: int):
 
 
 def test_a_packed_store_and_other_archives(tmp_path: Path):
-    """A store in a .zip is read; another archive is to be unpacked; a folder without a store is
-    cut off."""
+    """A .zip is read; others are to be unpacked or are cut off."""
     with zarr.storage.ZipStore(tmp_path / "a.zip", mode="w") as store:
         zarr.create_array(store, data=SKIN)
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.zip").values, SKIN)

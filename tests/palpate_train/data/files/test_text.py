@@ -221,8 +221,7 @@ WIDE = [[7 * r + c * c for c in range(16)] for r in range(1, 31)]
     ("word", "before"), [("time", "1.5,"), ("label", "cork,"), ("", "3,"), (None, "")]
 )
 def test_many_numbers_that_count_are_no_frame(count, form, word, before):
-    """Columns of a mat named by numbers, beside times, labels or nothing at all; a frame that
-    begins like all others stays."""
+    """Columns named by numbers; a frame that begins so stays."""
     if word is None and (count[0] > 1 or form != "{}"):
         return  # all are numbers: only 0 or 1 can be meant as the first column
     rows = [before + ",".join(map(str, row)) for row in WIDE]

@@ -195,8 +195,7 @@ def test_dilations_grow_with_the_window(window: int, longest: int):
     ids=str,
 )
 def test_filters_and_stride_follow_the_budgets(format: SweepFormat, filters: int, stride: int):
-    """Of taps, of multiply-accumulates and of responses; a large skin has four times of the
-    first two."""
+    """Of taps, operations and responses; large skins have more."""
     assert bank.count(format) == filters
     assert bank.stage(format, 1).stride == stride
 

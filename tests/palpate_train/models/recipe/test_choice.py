@@ -104,8 +104,7 @@ def test_what_lies_in_another_group_is_not_chosen():
 
 @pytest.mark.parametrize(("slow", "joins"), [(NOISE, True), (TRAP, False)])
 def test_slow_waves_join_unless_they_harm(slow: tuple[int, ...], joins: bool):
-    """They count as much as all other discriminants together. Noise does no harm and joins; a trap
-    that misleads two of three groups stays out."""
+    """Noise joins; a trap for two of three groups stays out."""
     given, parts = known(600)
     rng, x = np.random.default_rng(1), given.features.copy()
     x[:, GOOD] += 0.8 * rng.standard_normal((600, 2))
@@ -493,8 +492,7 @@ def test_worse_is_more_than_chance():
     ],
 )
 def test_one_part_may_show_what_carries_over(won: list[int], saved: float, carries: bool):
-    """Of a hundred sweeps in each part, so many more are classified correctly: the outermost value
-    alone may show the gain, but not against the loss, by chance, or at the cost of a group."""
+    """The outermost value alone, not against loss or by chance."""
     gain = np.concatenate([np.sign(n) * (np.arange(100) < abs(n)) for n in won]) / 300
     parts = np.repeat(np.arange(3), 100)
     groups = [(parts < 2, np.full(200, 1 / 300)), (parts == 2, np.full(100, 1 / 300))]

@@ -204,9 +204,7 @@ def uncalibrated(given: object) -> NoReturn:
 @pytest.mark.slow
 @pytest.mark.thorough  # fits three times
 def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """After an interruption of its training, the command continues after the last kept step and
-    gives the bits of an uninterrupted fit. Another seed begins anew, and nothing is left in the
-    cache."""
+    """With the bits of an uninterrupted one; another seed begins anew."""
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
@@ -306,8 +304,7 @@ def test_the_method_names_materials_that_it_never_saw_last():
 
 
 def test_groups_that_can_be_left_out_judge():
-    """Each group comes in parts, the first parts first. A group that cuts recordings or counts
-    trials is left out, and recordings judge if no group is left."""
+    """The first parts first; else recordings judge."""
     n = 24
     labels, recording = np.arange(n) % 2, np.arange(n) // 2
     groups = {"recording": recording, "speed": recording % 3, "force": recording % 2}
@@ -330,8 +327,7 @@ def test_groups_that_can_be_left_out_judge():
 
 
 def varied() -> Dataset:
-    """Easy sweeps under three forces, with two tools. Each force shows the materials at another
-    pitch: a new force hides them."""
+    """Easy sweeps under three forces, two tools; a new force hides the materials."""
     sweeps, n = easy(30), 90
     force = np.arange(n) % 3
     faster = np.array([1.0, 2.5, 5.0])[force]
@@ -343,8 +339,7 @@ def varied() -> Dataset:
 
 @pytest.mark.slow
 def test_the_hardest_condition_judges():
-    """The sweeps of a new force are the hardest, so some force is held out; a group of two values
-    comes last. Each condition has figures of its own."""
+    """Some force is held out; each condition has figures of its own."""
     made = recipe.fit(varied(), Run(1), CLOSED)
     assert made.about["conditions"] == ["force", "batch", "tool"]
     assert made.about["held_out_by"] == "force"

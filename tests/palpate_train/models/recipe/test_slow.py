@@ -41,8 +41,7 @@ def walks(format: SweepFormat) -> np.ndarray:
 
 @forms
 def test_the_lines_are_those_of_the_transform(format: SweepFormat):
-    """The first features are log powers of numpy's own transform, without the mean; each prefix
-    has the same waves as far as it goes, and a mean of its own."""
+    """numpy's, without the mean; prefixes as far as they go."""
     samples = walks(format)
     frames = format.window // PREFIXES * PREFIXES
     x = samples[:, :frames].reshape(3, frames, -1) * SCALE
@@ -71,8 +70,7 @@ def test_a_prefix_depends_on_no_later_frame(format: SweepFormat):
 
 
 def test_each_taxel_has_its_own_waves():
-    """A slow wave on one taxel moves the features of this taxel alone; one of a tenth moves the
-    bands of tenths."""
+    """A slow wave on one moves its features alone; so do tenths."""
     format = FORMATS[1]
     quiet = np.full((1, format.window, *format.shape), 100, format.numpy_type)
     for periods, tenth in ((3, False), (30, True)):

@@ -57,8 +57,7 @@ def trunk(
 
 
 def turned(x: np.ndarray) -> np.ndarray:
-    """The factor of each series of [n, T, R * C * A]: a series with more than three times the noise
-    of the fifth of sixteen is attenuated."""
+    """Factors of [n, T, R * C * A]: three times the noise of the fifth of sixteen is too loud."""
     step = max(x.shape[1] // 150, 1)
     noise = np.abs(x[:, 1::step] - x[:, :-1:step]).mean(1, keepdims=True)
     limit = 3 * -np.sort(-noise, axis=2)[:, :, [x.shape[2] // 4]]
@@ -143,8 +142,7 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
 def test_the_hum_of_the_mains_changes_nothing(
     rate_hz: float, window: int, deaf: bool, mains_hz: float
 ):
-    """50 Hz of any phase and strength on each taxel changes nothing if it can be separated; 60 Hz
-    changes the bands everywhere. In a fit for 60 Hz it is the reverse."""
+    """Of any phase if it can be separated; else everywhere."""
     format = SweepFormat(2, 2, rate_hz, window, "float32")
     counts, rng = drawn(format), np.random.default_rng(1)
     strength, phase = rng.uniform(35, 45, (2, 1, 2, 2)), rng.uniform(0, 1, (2, 1, 1, 1))
