@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate.core.errors import BundleError
 from palpate.core.schema import typed
@@ -21,10 +21,35 @@ PACKAGED = ""
 MOST_STARTS = 3
 """Largest number of starts without a commit; the next start goes back."""
 MOST_CUTS = 10
-"""Largest number of power-offs during a trial. Without this limit a bundle that switches the
-computer off would stay for ever."""
+"""Largest number of power-offs in a row, each before the trial had shown anything. Without this
+limit a bundle that switches the computer off would stay for ever. A start that answered a sweep or
+streamed for some minutes resets it: a cell that is switched off each evening is not at fault."""
 MOST_WHY = 300
 """Largest number of characters kept of the reason why a trial failed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """What ends a trial: so many sweeps with a label, or so much time in which the skin streamed;
+    or both of them."""
+
+    sweeps: int
+    streamed_s: float
+    both: bool = False
+
+    def reached(self, sweeps: int, streamed_s: float) -> bool:
+        """Whether the trial has ended."""
+        done = sweeps >= self.sweeps, streamed_s >= self.streamed_s
+        return all(done) if self.both else any(done)
+
+
+class Progress(NamedTuple):
+    """The part of a Standing that the program on trial records."""
+
+    starts: int
+    sweeps: int
+    streamed_s: float
+    worked: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +59,12 @@ class Standing:
     previous: the bundle to go back to while this bundle is current.
     counter: of its manifest.
     starts: number of starts on trial without an orderly end.
-    sweeps, streamed_s: progress of its trial at the last orderly end.
+    sweeps, streamed_s: progress of its trial, as of the last write.
     why: why its trial failed, "" if it did not.
     boot: id of the boot of the last counted start, "" if that start is no longer counted.
-    cuts: number of starts that ended by a power cut or a reset of the computer.
+    worked: whether the last start has made progress.
+    cuts: number of starts in a row that a power cut or a reset of the computer ended before they
+    had made progress.
     """
 
     previous: str = PACKAGED
@@ -48,14 +75,18 @@ class Standing:
     streamed_s: float = 0.0
     why: str = ""
     boot: str = ""
+    worked: bool = False
     cuts: int = 0
 
     def since(self, boot: str) -> Standing:
         """The state at a start in this boot. If the last counted start was in another boot, the end
-        of that boot ended it, so it counts as a cut and not against the bundle."""
+        of that boot ended it, so it does not count against the bundle, but as a cut if it had made
+        no progress."""
+        cuts = 0 if self.worked else self.cuts
         if not self.boot or not boot or self.boot == boot:
-            return self
-        return replace(self, starts=self.starts - 1, cuts=self.cuts + 1, boot="")
+            return replace(self, cuts=cuts)
+        cuts += not self.worked
+        return replace(self, starts=self.starts - 1, cuts=cuts, boot="")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +124,9 @@ class StoreState:
 
     def committed(self, sha: str) -> StoreState:
         """The state after `sha` passed its trial: bundles with a lower counter are refused."""
-        made = self.changed(sha, committed=True, starts=0, why="", boot="", cuts=0)
-        counter = self.of(sha).counter
+        standing = Standing(self.of(sha).previous, self.of(sha).counter)
+        made = replace(self, standings=self.standings | {sha: standing})
+        counter = standing.counter
         return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
 
     def left(self, sha: str, why: str) -> StoreState:

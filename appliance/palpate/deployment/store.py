@@ -23,7 +23,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from palpate.bundle import bundle
@@ -47,6 +47,8 @@ from palpate.deployment.state import (
     MOST_STARTS,
     PACKAGED,
     STATE_FILE,
+    Goal,
+    Progress,
     StoreState,
 )
 from palpate.deployment.trial import Trial
@@ -270,16 +272,17 @@ class Store:
             self._set_current(back)
         return back
 
-    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Record the progress of the trial of `sha`, and whether this start counts in `starts`.
+    @property
+    def goal(self) -> Goal:
+        """What ends a trial."""
+        return Goal(self.settings.trial_sweeps, self.settings.trial_s)
+
+    def note(self, sha: str, progress: Progress, *, counted: bool) -> None:
+        """Record the progress of the trial of `sha`, and whether this start counts in its starts.
         Does not wait: raises ApplianceError if another command holds the lock."""
         boot = self._boot if counted else ""
         with self._locked(0.0) as state:
-            self._write(
-                state.changed(
-                    sha, starts=starts, boot=boot, sweeps=sweeps, streamed_s=round(streamed_s, 1)
-                )
-            )
+            self._write(state.changed(sha, boot=boot, **progress._asdict()))
 
     def _committed(self, sha: str) -> Choice:
         """A committed bundle for this start."""
@@ -308,7 +311,7 @@ class Store:
             raise BundleError(f"it does not fit the settings: {e}; change one of them") from e
         standing = self.state.of(sha)
         log.info(f"bundle {sha[:8]} is on trial, start {standing.starts} of {MOST_STARTS}")
-        return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing))
+        return Choice(loaded, self.bundles.at(sha), Trial(self, sha, f"bundle {sha[:8]}", standing))
 
     def _count(self, sha: str) -> str:
         """Count a start of `sha`. Returns why it must not be started again, "" if it may."""
@@ -317,10 +320,10 @@ class Store:
             if standing.starts >= MOST_STARTS:
                 return standing.why or f"it was started {MOST_STARTS} times without being committed"
             if standing.cuts >= MOST_CUTS:
-                return f"the box was switched off {MOST_CUTS} times while it was on trial"
-            self._write(
-                state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts)
-            )
+                return f"the box was switched off {MOST_CUTS} times, each time soon after its start"
+            starts = standing.starts + 1
+            begun = replace(standing, starts=starts, boot=self._boot, worked=False)
+            self._write(state.changed(sha, **asdict(begun)))
         return ""
 
     def _warn_of_removed_state(self) -> None:

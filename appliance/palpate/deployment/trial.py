@@ -1,9 +1,9 @@
-"""Observes a bundle on trial and records in the store its progress, the starts that count against
-it, and the commit after enough sweeps and seconds.
+"""Observes a bundle or a release on trial and records its progress, the starts that count against
+it, and the commit at its goal.
 
-`Store.choose` counts a start before the bundle is read. The start is no longer counted while the
-skin is away, after the program has ended in order or because a device is missing, and at the next
-start if the computer was booted in between.
+`Store.choose`, and for a release `releases.begin`, count a start before anything of it runs. The
+start is no longer counted while the skin is away, after the program has ended in order or because a
+device is missing, and at the next start if the computer was booted in between.
 """
 
 from __future__ import annotations
@@ -18,74 +18,75 @@ from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
 from palpate.core.status import Status
-from palpate.deployment.state import STATE_FILE
+from palpate.deployment.state import Progress
 
 if TYPE_CHECKING:
-    from palpate.core.config import StoreConfig
     from palpate.core.health import Health
     from palpate.core.types import Verdict
-    from palpate.deployment.state import Standing
+    from palpate.deployment.state import Goal, Standing
 
 RETRY_NS = 10_000_000_000
 """Pause after a failed write."""
+WORKED_S = 300.0
+"""A start has made progress after a sweep with a label, or after so much time in which the skin
+streamed. Progress is recorded as often: a cell may be switched off without an orderly end."""
 ERRORS = (OSError, ApplianceError)
 """Errors of a write to the store: of the disk, or because another command holds the lock."""
 
 
 class TrialStore(Protocol):
-    """The part of the store that a trial uses. Both methods raise OSError or ApplianceError if
-    nothing could be written."""
+    """The part of a store that a trial uses. The methods raise OSError or ApplianceError if nothing
+    could be written."""
 
     @property
-    def settings(self) -> StoreConfig:
-        """Settings with the number of sweeps and seconds of a trial."""
+    def goal(self) -> Goal:
+        """What ends the trial."""
 
-    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
-        """Record the progress of the trial of `sha`, and whether this start counts in
-        `starts`."""
+    def note(self, sha: str, progress: Progress, *, counted: bool) -> None:
+        """Record the progress of the trial of `sha`, and whether this start counts."""
 
     def commit(self, sha: str | None, wait_s: float) -> bool:
         """End the trial of `sha`. Returns whether it was on trial."""
 
 
 class Trial(Observer):
-    """Observes one bundle's trial; also a context around the run.
+    """Observes one trial; also a context around the run.
 
-    standing: state of the bundle with this start counted. disk: writes the state. Trouble with it
-    raises no error: a failed write is logged once and tried again after RETRY_NS, and classifying
-    goes on.
+    sha: what is on trial in the store. title: the same for a person. standing: its state with this
+    start counted. disk: writes the state. Trouble with it raises no error: a failed write is logged
+    once and tried again after RETRY_NS, and classifying goes on.
     """
 
     disk: DiskWork = AtOnce()
 
-    def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
-        self._store, self._sha = store, sha
+    def __init__(self, store: TrialStore, sha: str, title: str, standing: Standing) -> None:
+        self._store, self._sha, self._title = store, sha, title
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
         self._done = False  # the commit has ended the trial
         self._last_ns: int | None = None  # time of the last turn if it had frames
+        self._worked, self._noted_ns = False, self._streamed_ns  # progress up to the last write
         self._next_ns, self._over, self._stale, self._busy = 0, False, False, False
-        self._log = TroubleLog(
-            f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
-        )
+        self._log = TroubleLog(f"trial of {title} cannot be recorded", "it is tried again")
 
     @property
     def text(self) -> str:
         """Progress of the trial, for a person; "" after its end."""
         if self._over:
             return ""
-        settings = self._store.settings
+        goal = self._store.goal
         return (
-            f"on trial: {self._sweeps} of {settings.trial_sweeps} sweeps, "
-            f"{self._streamed_ns / 1e9:.0f} of {settings.trial_s:.0f} s"
+            f"on trial: {self._sweeps} of {goal.sweeps} sweeps, "
+            f"{self._streamed_ns / 1e9:.0f} of {goal.streamed_s:.0f} s"
         )
 
     def answered(self, verdict: Verdict) -> None:
-        """Count a sweep to which the bundle gave a label. A sweep on which it failed begins the
-        trial anew."""
+        """Count a sweep with a label. A sweep on which the bundle failed begins the trial anew."""
         self._sweeps += bool(verdict.label)
+        if verdict.label and not self._worked:
+            self._worked = self._stale = True
         if verdict.status is Status.FAILED:
-            self._sweeps, self._streamed_ns, self._stale = 0, 0, True
+            self._sweeps, self._streamed_ns, self._noted_ns, self._stale = 0, 0, 0, True
 
     def turn(self, health: Health) -> None:
         """Add the time in which the skin streamed. Record changes, or commit after enough sweeps
@@ -94,6 +95,8 @@ class Trial(Observer):
             return
         if health.streams and self._last_ns is not None:
             self._streamed_ns += health.time_ns - self._last_ns
+            if self._streamed_ns - self._noted_ns >= WORKED_S * 1e9:
+                self._worked = self._stale = True
         self._last_ns = health.time_ns if health.streams else None
         if health.time_ns >= self._next_ns and not self._busy:
             self._record(health)
@@ -122,12 +125,12 @@ class Trial(Observer):
 
     def _record(self, health: Health) -> None:
         """Record or commit if needed. A commit waits until no sweep is open."""
-        settings, counted = self._store.settings, health.streams
-        if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
+        counted = health.streams
+        if self._store.goal.reached(self._sweeps, self._streamed_ns / 1e9):
             if not health.sweeping:
                 self._write(health, self._commit, self._end)
         elif counted != self._counted or self._stale:
-            self._stale = False
+            self._stale, self._noted_ns = False, self._streamed_ns
             note = self._note(counted)
             self._write(health, note, partial(setattr, self, "_counted", counted))
 
@@ -147,8 +150,9 @@ class Trial(Observer):
 
     def _note(self, counts: bool) -> Callable[[], object]:
         """The write of the present progress."""
-        starts, s = self._starts - (not counts), self._streamed_ns / 1e9
-        return partial(self._store.note, self._sha, starts, counts, self._sweeps, s)
+        starts, s = self._starts - (not counts), round(self._streamed_ns / 1e9, 1)
+        progress = Progress(starts, self._sweeps, s, self._worked)
+        return partial(self._store.note, self._sha, progress, counted=counts)
 
     def _commit(self) -> None:
         self._done = self._store.commit(self._sha, 0.0)
@@ -156,4 +160,4 @@ class Trial(Observer):
     def _end(self) -> None:
         self._over = True
         if self._done:
-            log.info(f"bundle {self._sha[:8]} has passed its trial and is committed")
+            log.info(f"{self._title} has passed its trial and is committed")

@@ -93,6 +93,23 @@ def test_power_cuts_do_not_count_against_the_bundle(box):
     assert box.start() == box.one
 
 
+@pytest.mark.parametrize("sweeps", [0, 1], ids=["no sweep", "a sweep"])
+def test_thirty_days_each_ended_by_the_mains_switch_commit_the_bundle(box, sweeps):
+    """Little work a day: with a sweep, or with 301 s of streaming, the bundle is committed by what
+    all days have shown. Ten power-offs soon after the start before that leave it on trial."""
+    for day in range(30):
+        booted(box, f"day {day}")
+        choice = box.store.choose()
+        assert choice.bundle.id == box.two[:8]
+        if choice.trial and day > 8:  # days on which nothing happens, at first
+            for t in range(302 * (1 - sweeps)):
+                choice.trial.turn(health(t))
+            for _ in range(sweeps):
+                choice.trial.answered(verdict())
+                choice.trial.turn(health(0))
+    assert box.standing.committed
+
+
 @pytest.mark.slow
 def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box):
     """The bundle is replaced after ten power cuts. Else a bundle that resets the computer would
