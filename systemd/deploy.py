@@ -28,6 +28,8 @@ READY_S, STARTS = 60, 5
 itself, so after five there is no hope."""
 MOST_STATUS = 1 << 20
 """Most bytes that are read of a status file."""
+COUNTER = "/etc/palpate/counter"
+"""Root's file with the counter of the last delivery."""
 LIMIT_S = 300
 """Time limit for each box."""
 
@@ -35,10 +37,11 @@ LIMIT_S = 300
 @dataclass(frozen=True)
 class BundleArchive:
     """A bundle as it is copied to boxes. sha: its name in their stores. name: for messages.
-    archive: a tar of its files."""
+    counter: of its manifest. archive: a tar of its files."""
 
     sha: str
     name: str
+    counter: int
     archive: bytes
 
 
@@ -84,13 +87,14 @@ def checked(folder: Path, signers: Path | None) -> BundleArchive:
             tar.addfile(member, io.BytesIO(data))
     m = loaded.manifest
     sha = bundle.name(files)
-    return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", archive.getvalue())
+    return BundleArchive(sha, f"{m.name} {m.version} ({loaded.id})", m.counter, archive.getvalue())
 
 
 def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool) -> str:
     """Install the bundle on one box, or make it the candidate there; the line for this box."""
     store, status = where(box)
     if not shadow and _runs(box, packed, store, status):
+        box.run("noting its counter", raised(packed.counter), user="root")
         return f"{packed.name} runs already"
     file, incoming = f".palpate-{packed.sha[:16]}.tar", f"{store}/incoming"
     box.put(io.BytesIO(packed.archive), file)
@@ -105,7 +109,18 @@ def deliver(box: FleetBox, packed: BundleArchive, shadow: bool, other_skin: bool
     install = f"{PALPATE} bundles install {incoming}/{packed.sha}{how}"
     box.run("checking it there", install, user="palpate", limit_s=120)
     box.run("tidying up", f"rm -r {incoming}/{packed.sha}", user="palpate")
+    if not shadow:
+        box.run("noting its counter", raised(packed.counter), user="root")
     return outcome(box, packed, ready=box.restart(READY_S, STARTS), shadow=shadow)
+
+
+def raised(counter: int, file: str = COUNTER) -> str:
+    """The command that lets a box refuse bundles with a lower counter, also when the state of its
+    store is removed. An earlier, higher counter stays."""
+    return (
+        f'umask 022; [ "$(cat {file} 2> /dev/null || echo 0)" -ge {counter} ] || '
+        f"{{ echo {counter} > {file}.new && sync -f {file}.new && mv {file}.new {file}; }}"
+    )
 
 
 def where(box: FleetBox) -> tuple[str, str]:

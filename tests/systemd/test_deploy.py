@@ -327,6 +327,8 @@ def test_a_bundle_is_delivered_and_runs_on_trial(box: DeployedBox, sender: Sende
     (figures,) = json.loads((tmp_path / "report.json").read_text())["boxes"].values()
     assert figures["lost_s"] <= figures["ready_s"]
     assert (box.listed()[sha], box.serves()) == ("on trial", sha[:8])
+    assert box.get("stat", "-c", "%U %a", "/etc/palpate/counter") == "root 644"
+    assert box.get("cat", "/etc/palpate/counter") == str(sender.counter)
     left = box.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}")
     assert ".palpate" not in left
     before = box.runs()

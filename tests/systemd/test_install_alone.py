@@ -119,3 +119,15 @@ def test_a_signer_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "file"))
     assert "SIGNERS=FILE" in run_here(SIGNER)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(None, "7"), ("6", "7"), ("8", "8"), ("x", "7")])
+def test_a_delivery_raises_the_counter_of_root(tmp_path: Path, before: str | None, after: str):
+    """A higher counter stays, and one that is no number is written again."""
+    file = tmp_path / "counter"
+    if before is not None:
+        file.write_text(before)
+    shell(run_here(f"import deploy; print(deploy.raised(7, {str(file)!r}))"))
+    assert file.read_text().strip() == after
+    assert [*tmp_path.iterdir()] == [file]

@@ -175,11 +175,11 @@ class StoreConfig:
     """The folders of the box.
 
     folder: bundles, recordings and black box (layout: deployment/store.py). keys: folder of
-    `allowed_signers`, the accepted keys in the format of ssh-keygen, and of `enrolment/`, this
-    box's key for its own labels. runtime: folder of the status file and of the feed's socket
-    (PROTOCOL.md, part 4); "" for neither. black_box: number of latest sweeps to keep, 0 for none.
-    trial_sweeps: a new bundle is committed once it has given a label to this many sweeps, or the
-    skin has streamed for 600 s.
+    `allowed_signers`, the accepted keys in the format of ssh-keygen, of `counter`, that of the last
+    delivery, and of `enrolment/`, this box's key for its own labels. runtime: folder of the status
+    file and of the feed's socket (PROTOCOL.md, part 4); "" for neither. black_box: number of latest
+    sweeps to keep, 0 for none. trial_sweeps: a new bundle is committed once it has given a label to
+    this many sweeps, or the skin has streamed for 600 s.
     """
 
     folder: str = "/var/lib/palpate"
@@ -193,6 +193,11 @@ class StoreConfig:
     def signers(self) -> Path:
         """The file of the keys whose bundles are accepted."""
         return Path(self.keys) / "allowed_signers"
+
+    @property
+    def least_counter(self) -> Path:
+        """The file of root with the counter of the last delivery; older bundles are refused."""
+        return Path(self.keys) / "counter"
 
     @property
     def enrolment_key(self) -> Path:

@@ -152,13 +152,17 @@ class StoreState:
             self, standings={sha: one for sha, one in self.standings.items() if sha in kept}
         )
 
-    def admit(self, sha: str, counter: int) -> None:
-        """Raises BundleError if the bundle is older than a bundle that was committed."""
-        if counter <= self.counter and sha != self.highest:
+    def admit(self, sha: str, counter: int, least: int = 0) -> None:
+        """Raises BundleError if the bundle is older than a bundle that was committed, or than the
+        last delivery, whose counter is `least`."""
+        if sha == self.highest:
+            return
+        known = max(self.counter, least - 1)
+        if counter <= known:
             raise BundleError(
-                f"bundle has counter {counter}, and {self.counter} was committed here before; sign "
-                "it with a higher counter (palpate-train sign --counter), or use `palpate bundles "
-                "rollback` to go back"
+                f"bundle has counter {counter}, and {max(self.counter, least)} was delivered here "
+                "before; sign it with a higher counter (palpate-train sign --counter), or use "
+                "`palpate bundles rollback` to go back"
             )
 
     def json(self) -> bytes:

@@ -122,7 +122,7 @@ class Store:
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
                 f"{path} cannot be read: {e}; without this file the current bundle counts as "
-                "committed, and any counter is accepted: remove it if you can vouch for both"
+                "committed, and only root's counter is known: remove it if you can vouch for both"
             ) from e
 
     def examine(self, folder: Path) -> SignedBundle:
@@ -326,13 +326,28 @@ class Store:
             self._write(state.changed(sha, **asdict(begun)))
         return ""
 
+    @property
+    def _least(self) -> int:
+        """The counter of the last delivery, by root's file; 0 if nothing was delivered. User
+        palpate can remove the state, but not this file."""
+        path = self.settings.least_counter
+        try:
+            return int(path.read_text("ascii"))
+        except FileNotFoundError:
+            return 0
+        except ValueError as e:
+            raise ConfigError(
+                f"{path} holds no number, so it is not known which bundles are too old; write the "
+                "counter of the last delivery there"
+            ) from e
+
     def _warn_of_removed_state(self) -> None:
         """Say so if bundles were deployed and their state is gone."""
         if os.path.lexists(self._link) and not os.path.lexists(self._state_file):
             log.warning(
                 f"{self._state_file} is missing although bundles were deployed: it is not known"
-                " which counters were committed, so older bundles are accepted again; find out who"
-                " removed it"
+                " which counters were committed, so older bundles are accepted again, down to the"
+                f" counter in {self.settings.least_counter}; find out who removed it"
             )
 
     def _uncount(self, sha: str) -> None:
@@ -365,7 +380,7 @@ class Store:
             new, running = signed.bundle, self.running().bundle
             if new.base == running.base and (new.added or running.added):
                 return
-        state.admit(signed.sha, signed.bundle.manifest.counter)
+        state.admit(signed.sha, signed.bundle.manifest.counter, self._least)
 
     def _activate(self, signed: SignedBundle, state: StoreState) -> None:
         self._write(state.activated(signed.sha, signed.bundle.manifest.counter, self.current))

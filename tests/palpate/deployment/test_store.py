@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -293,6 +294,27 @@ def test_a_removed_state_is_told(box, logged):
     logged.clear()
     box.installed(3)
     assert any("bundles" in line for line in logged)
+
+
+@pytest.mark.parametrize(
+    ("least", "counter", "error"),
+    [
+        ("4\n", 3, BundleError),
+        ("4\n", 4, None),
+        ("3\n", 5, None),
+        ("four", 5, ConfigError),
+        ("", 5, ConfigError),
+    ],
+)
+def test_a_counter_of_root_refuses_what_the_removed_state_would_accept(box, least, counter, error):
+    """The delivery before had this counter, and the service's user has removed all of the store;
+    a file without a number accepts nothing."""
+    box.installed(4)
+    box.how.least_counter.write_text(least)
+    shutil.rmtree(box.how.folder)
+    Path(box.how.folder).mkdir()
+    with pytest.raises(error) if error else nullcontext():
+        assert box.installed(counter) == box.store.current
 
 
 def test_a_damaged_bundle_is_mended_by_deploying_it_again(box):
