@@ -30,8 +30,8 @@ MOST_WHY = 300
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What ends a trial: so many sweeps with a label, or so much time in which the skin streamed;
-    or both of them."""
+    """The end of a trial: a number of sweeps with a label, a time in which the skin streamed,
+    or both."""
 
     sweeps: int
     streamed_s: float

@@ -274,7 +274,7 @@ class Store:
 
     @property
     def goal(self) -> Goal:
-        """What ends a trial."""
+        """The end of a trial."""
         return Goal(self.settings.trial_sweeps, self.settings.trial_s)
 
     def note(self, sha: str, progress: Progress, *, counted: bool) -> None:

@@ -40,7 +40,7 @@ class TrialStore(Protocol):
 
     @property
     def goal(self) -> Goal:
-        """What ends the trial."""
+        """The end of the trial."""
 
     def note(self, sha: str, progress: Progress, *, counted: bool) -> None:
         """Record the progress of the trial of `sha`, and whether this start counts."""
@@ -52,7 +52,7 @@ class TrialStore(Protocol):
 class Trial(Observer):
     """Observes one trial; also a context around the run.
 
-    sha: what is on trial in the store. title: the same for a person. standing: its state with this
+    sha: the name in the store. title: the name for a person. standing: its state with this
     start counted. disk: writes the state. Trouble with it raises no error: a failed write is logged
     once and tried again after RETRY_NS, and classifying goes on.
     """
