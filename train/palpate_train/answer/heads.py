@@ -87,6 +87,10 @@ class HeadData:
             None if self.weights is None else self.weights[kept],
         )
 
+    def seen(self, columns: Array) -> HeadData:
+        """The features of these numbers alone."""
+        return replace(self, features=self.features[:, columns], copied=self.copied[:, columns])
+
     def beside(self, other: HeadData) -> HeadData:
         """These features, then those of `other`, for the same sweeps and copies."""
         features = np.hstack([self.features, other.features])

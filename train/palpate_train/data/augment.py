@@ -258,10 +258,13 @@ def _lerp(start: Array, end: Array, share: Array) -> Array:
 def texture_scale(samples: NDArray[Any]) -> float:
     """The factor that gives raw counts [N, T, R, C] a deviation of 1 after the mean of each taxel
     over its sweep is subtracted."""
-    # float32 would add row after row, and round the more the longer the sweeps are
-    means = samples.mean(axis=1, keepdims=True, dtype=np.float64).astype(np.float32)
-    deviation = samples - means
-    return float(1 / max(np.sqrt(np.mean(deviation**2)), 1e-6))
+    squares = 0.0
+    for start in range(0, len(samples), BATCH):  # whole sets would be copied thrice
+        some = samples[start : start + BATCH]
+        # float32 would add row after row, and round the more the longer the sweeps are
+        deviation = some - some.mean(axis=1, keepdims=True, dtype=np.float64).astype(np.float32)
+        squares += float(np.square(deviation).sum(dtype=np.float64))
+    return float(1 / max(np.sqrt(squares / samples.size), 1e-6))
 
 
 def copies(sweeps: Dataset, augmentation: Augmentation, seed: int, count: int) -> Iterator[Dataset]:

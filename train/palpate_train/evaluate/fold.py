@@ -268,10 +268,12 @@ def reached(modules: Sequence[str]) -> set[str]:
 
 
 def _file(module: str) -> Path:
-    spec = find_spec(module)
+    """The file that a module has, if it is one. An import would load PyTorch for its name alone."""
+    package, *names = module.split(".")
+    spec = find_spec(package)
     if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(f"{module} has no file")
-    return Path(spec.origin)
+        raise ModuleNotFoundError(f"{package} has no file")
+    return Path(spec.origin).parent.joinpath(*names).with_suffix(".py")
 
 
 @cache
@@ -285,13 +287,4 @@ def _imported(module: str) -> tuple[str, ...]:
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
     ours = tuple(f"{package}." for package in COUNTED)
-    return tuple(name for name in names if name.startswith(ours) and _is_module(name))
-
-
-def _is_module(name: str) -> bool:
-    """Whether `name` is a module, not a package or an object in a module."""
-    try:
-        spec = find_spec(name)
-    except ModuleNotFoundError:  # its parent is a module, not a package
-        return False
-    return spec is not None and spec.submodule_search_locations is None
+    return tuple(name for name in names if name.startswith(ours) and _file(name).is_file())

@@ -185,8 +185,7 @@ class Judgement:
     def fit(self, name: str) -> Fit:
         """The finished model of this size."""
         one = self.sizes[name]
-        trunk, plan = recipe.pruned(self.setup.fixed.trunk, one.trunk, one.judged.chosen.plan)
-        return recipe.finish(trunk, plan, one.judged, self.setup)
+        return recipe.finish(one.trunk, one.judged, self.setup)
 
     def first_equals(self) -> dict[str, str]:
         """For each size the first one whose model is the same, often itself: a larger size may

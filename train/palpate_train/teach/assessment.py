@@ -49,8 +49,7 @@ def assess(lesson: Lesson) -> Assessment:
         chosen = scores.score(chosen.plan.parts)
     found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
     with suppress(ApplianceError):  # too few sweeps for a bundle
-        trunk, plan = recipe.pruned(fixed.trunk, None, choice.chosen.plan)
-        found = replace(found, others=others(recipe.finish(trunk, plan, choice, setup)))
+        found = replace(found, others=others(recipe.finish(None, choice, setup)))
     return found
 
 

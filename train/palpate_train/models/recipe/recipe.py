@@ -301,8 +301,7 @@ def fit_size(setup: Setup, size: ModelSize) -> Fit:
     """The model of this size. Raises FormatError if the windows are too short for it."""
     fixed = setup.fixed.limited(size)
     stages, judged = judged_size(fixed, setup, size)
-    trunk, plan = pruned(fixed.trunk, stages, judged.chosen.plan)
-    return finish(trunk, plan, judged, setup)
+    return finish(stages, judged, setup)
 
 
 def judged_size(
@@ -387,11 +386,14 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
     return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
 
 
-def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fit:
+def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
     """Step 6: heads of the float and the int8 trunk, calibration and contacts."""
     settings, classes, heads = setup.settings, len(setup.sweeps.materials), {}
-    for name, int8 in (("head", False), ("int8", True)):
-        weight, bias = plan.fit(setup.data(trunk, int8), classes)
+    fixed, chosen = setup.fixed, judged.chosen.plan
+    trunk, plan = pruned(fixed.trunk, stages, chosen)
+    known = setup.stages[1].beside(fixed.data) if stages else fixed.data
+    for name, data in (("head", setup.data(trunk, False)), ("int8", known.seen(chosen.columns()))):
+        weight, bias = plan.fit(data, classes)
         heads[f"{name}.weight"] = weight - weight.mean(axis=0)
         heads[f"{name}.bias"] = bias - bias.mean()
     about = {
