@@ -5,9 +5,9 @@ Writes docs/data/robots-side-by-side.json and the table of docs/robots/README.md
 if the attacked box was worse off.
 
 Both are `palpate run --sim skin` with the same sweeps, in real time, at the same time on this
-machine. The page, the TCP bridge (on its serial line), the Modbus bridge and readers (on its feed)
-are attached to the first; each of these four has hostile peers. Only boxes and listeners run with
-real-time priority, if that is allowed.
+machine. The page, the TCP bridge (on its serial line), the bridges of Modbus and OPC UA and readers
+(on its feed) are attached to the first; each of these five has hostile peers. Only boxes and
+listeners run with real-time priority, if that is allowed.
 """
 
 import argparse
@@ -19,9 +19,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ RESULTS = ROOT / "docs" / "data" / "robots-side-by-side.json"
 SWEEP_S = 3.0
 """Shortest time between two sweeps of the robot."""
 WAIT_S = 0.1
+LISTENS = re.compile(r"127\.0\.0\.1:(\d+)")
 LATE_MS = 1.0
 """Largest additional median of the times inside the box and to the robot's end."""
 LOST, DROPPED = 7, 10
@@ -214,18 +215,25 @@ def said(attackers: subprocess.Popen[bytes]) -> dict[str, int]:
 
 
 @contextmanager
-def page_of(feed: Path) -> Iterator[int]:
-    """Start the page of the box with this feed; returns its port."""
-    command = [
-        *(sys.executable, "-m", "palpate", "watch", "--web", "0"),
-        *("--set", f"store.runtime={feed.parent}"),
-    ]
+def listening(*words: str) -> Iterator[int]:
+    """Run a module of Python as a process of its own; yields its port on loopback, from its log.
+    Nothing waits for it without a limit."""
+    command = [sys.executable, "-m", *words]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        late = threading.Timer(START_S, process.kill)
+        late.start()
         try:
-            line = process.stderr.readline()  # type: ignore[union-attr]
-            yield int(re.findall(r":(\d+)", line)[-1])
+            log = iter(process.stderr.readline, "")  # type: ignore[union-attr]
+            port = next(int(at[1]) for line in log if (at := LISTENS.search(line)))
+            late.cancel()
+            # a log that nobody reads would fill its pipe, and then stop the program
+            threading.Thread(target=deque, args=(log, 0), daemon=True).start()
+            yield port
         finally:
             process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(COME_S)
+            process.kill()
 
 
 def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
@@ -243,7 +251,15 @@ def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
             "feed": feed,
             "tcp": attached.enter_context(bridge("tcp", "--port", line.line))[1],
             "modbus": attached.enter_context(bridge("modbus", "--feed", feed))[1],
-            "page": attached.enter_context(page_of(feed)),
+            "opcua": attached.enter_context(
+                listening(
+                    *("palpate.bridges", "opcua", "--feed", str(feed), "--anonymous"),
+                    *("--listen", "127.0.0.1:0", "--folder", str(feed.parent / "opcua")),
+                )
+            ),
+            "page": attached.enter_context(
+                listening("palpate", "watch", "--web", "0", "--set", f"store.runtime={feed.parent}")
+            ),
         }
         peers = {kind: attack(attached, kind, where) for kind, where in there.items()}
         print(f"attached: {', '.join(peers)}", flush=True)
@@ -280,7 +296,10 @@ def worse(boxes: dict[str, Any]) -> list[str]:
     return [text for text, bad in checks.items() if bad]
 
 
-NAMES = {"alone": "nothing attached", "attacked": "page, TCP, Modbus and feed, all attacked"}
+NAMES = {
+    "alone": "nothing attached",
+    "attacked": "page, TCP, Modbus, OPC UA and feed, all attacked",
+}
 
 
 def table(content: dict[str, Any]) -> str:

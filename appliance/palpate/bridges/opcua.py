@@ -32,6 +32,7 @@ from palpate.bridges.opcua_model import (
     state,
 )
 from palpate.bridges.opcua_security import Login, hide_open_endpoint, limit, own_certificate
+from palpate.bridges.opcua_space import SmallServer
 from palpate.bridges.server import CLOSE_S, not_listening
 from palpate.bridges.source import BoxView, Source
 from palpate.client import verdicts
@@ -90,7 +91,7 @@ class OpcuaBridge:
         self._start_s: float | None = None
         self._nodes: dict[str, Node] = {}
         users = Login(user, password, clock, anonymous=offer.anonymous)
-        self._server, self._users = Server(user_manager=users), bool(user)
+        self._server, self._users = Server(SmallServer(user_manager=users)), bool(user)
         self._event: EventGenerator | None = None
         self._writing: asyncio.Task[None] | None = None
         self.source = source(self._take)

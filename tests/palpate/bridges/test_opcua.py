@@ -223,8 +223,9 @@ def test_users(box, folder, caplog):
 
 
 @pytest.mark.slow
-def test_hostile_bytes(box, folder):
-    """Other protocols, endless messages, silent connections are closed; a client reads on."""
+def test_hostile_bytes(box, folder, caplog):
+    """Other protocols, endless messages, silent connections are closed; a client reads on, and the
+    log does not fill."""
     with served(box, folder, "--anonymous") as url, reader(url) as client:
         port = int(url.rpartition(":")[2].strip("/"))
         endless = b"HELF" + (0xFFFFFFF0).to_bytes(4, "little")
@@ -241,6 +242,33 @@ def test_hostile_bytes(box, folder):
         assert client.nodes.server.get_children()
         for one in silent:
             one.close()
+    assert not [one for one in caplog.records if one.name.startswith("asyncio")]
+
+
+@pytest.mark.slow
+def test_the_nodes_of_the_standard(box, folder):
+    """A client that walks through the whole server finds each node that another refers to, with its
+    type; and the status of the server, its limits and the fields of events are there."""
+    with served(box, folder, "--anonymous") as url, reader(url) as client:
+        known, waiting = set(), [client.nodes.root.nodeid]
+        while waiting:
+            known.add(at := waiting.pop())
+            named = client.get_node(at).get_references()
+            for one in named:
+                if one.NodeId not in known and one.NodeId not in waiting:
+                    waiting.append(one.NodeId)
+            assert client.get_node(at).read_browse_name().Name
+        identifiers = {one.Identifier for one in known if one.NamespaceIndex == 0}
+        assert identifiers > {*range(1, 13), 58, 61, 63, 68, 84, 85, 2041, 2253}
+        assert client.nodes.server_state.read_value() == ua.ServerState.Running
+        limit = client.get_node(
+            ua.ObjectIds.Server_ServerCapabilities_OperationLimits_MaxNodesPerRead
+        )
+        assert limit.read_value() == 10_000
+        fields = {
+            one.read_browse_name().Name for one in client.nodes.base_event_type.get_children()
+        }
+        assert fields > {"EventId", "EventType", "Message", "Severity", "SourceName", "Time"}
 
 
 def test_without_a_login_it_does_not_start(box, tmp_path):
