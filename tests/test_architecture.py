@@ -42,6 +42,7 @@ EXTRAS = {
     "service/network.py": {"zeroconf", "ifaddr"},
     "bridges/opcua.py": {"asyncua"},
     "bridges/opcua_model.py": {"asyncua"},
+    "bridges/opcua_space.py": {"asyncua"},
     "bridges/opcua_security.py": {"asyncua", "cryptography"},
     "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},

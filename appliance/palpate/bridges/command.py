@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from palpate.bridges.options import FEED_KINDS, LINKS, MOST, PORTS, add_arguments
+from palpate.bridges.results import Results
 from palpate.bridges.server import TcpServer, address, stop_event, until
 from palpate.bridges.source import FeedSource, LineSource, LinkPort
 from palpate.client.box import Heard
@@ -31,23 +32,22 @@ from palpate.core.text import printable
 from palpate.service import network
 
 EVERY_S = 1.0
-OF_BROKER = ("broker", "login", "ca", "name")
-"""Options of the MQTT bridge, and settings of the same names."""
+SETTINGS = ("allow_writes", "short", "anonymous", "broker", "login", "ca", "name")
+"""Options of some bridges, and settings of the same names."""
 
 
 def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     """Fill in missing options from the settings of the box. Raises ConfigError if the settings give
     the bridge no serial line."""
+    bridge = settings.bridge
     if kind in PORTS and args.listen is None:
-        args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
-    args.allow_writes = args.allow_writes or settings.bridge.allow_writes
-    if kind == "tcp":
-        args.short = args.short or settings.bridge.short
-    if kind == "opcua":
-        bridge = settings.bridge
-        args.folder, args.memory = args.folder or Path(bridge.opcua), Path(bridge.memory)
-        args.name = args.name or bridge.name
-        args.anonymous = args.anonymous or bridge.anonymous
+        args.listen = f"{bridge.address}:{PORTS[kind]}"
+    for name in SETTINGS:
+        setattr(args, name, getattr(args, name, None) or getattr(bridge, name))
+    args.folder, args.memory = (
+        getattr(args, "folder", None) or Path(bridge.opcua),
+        Path(bridge.memory),
+    )
     if args.port or args.link or args.feed:
         return
     if settings.serial.port == LINKS[kind]:
@@ -117,11 +117,10 @@ def _tcp(args: argparse.Namespace) -> Served:
 
 def _opcua(args: argparse.Namespace) -> Served:
     with _needed("the OPC UA server", "opcua"):
-        from palpate.bridges.mqtt_options import box_name
         from palpate.bridges.opcua import Offer, OpcuaBridge
 
     offer = Offer(
-        *(args.folder, args.memory, box_name(args.name), args.most),
+        *(args.folder, args.memory, network.box_name(args.name), args.most),
         writes=args.allow_writes,
         anonymous=args.anonymous,
     )
@@ -158,7 +157,7 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
         try:
             await server.open(host, port)
             _say(args, server, box)
-            ends.append(network.announce(args.kind, *server.address, settings.bridge.name))
+            ends.append(network.announce(args.kind, *server.address, args.name))
             await until(stop, EVERY_S, work)
         finally:
             for end in ends:
@@ -175,19 +174,20 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
 def run_mqtt(args: argparse.Namespace) -> int:
     """`palpate bridge mqtt`, until SIGTERM. Raises ConfigError without paho or a broker."""
     with _needed("the MQTT client", "mqtt"):
-        from palpate.bridges import mqtt, mqtt_options
+        from palpate.bridges import mqtt
+        from palpate.bridges.mqtt_broker import broker
 
     settings = config.load(None)
     settle("mqtt", args, settings)
-    given = {name: getattr(args, name) or getattr(settings.bridge, name) for name in OF_BROKER}
-    broker = mqtt_options.broker(given["broker"], given["login"], given["ca"])
-    name = mqtt_options.box_name(given["name"])
+    there = broker(args.broker, args.login, args.ca)
+    name = network.box_name(args.name)
 
     async def serve() -> int:
         stop = stop_event()
         _warn(args)
         bridge = mqtt.MqttBridge(
-            *(broker, name, partial(_source, args), SystemClock(), stop.is_set),
+            *(there, name, partial(_source, args), SystemClock(), stop.is_set),
+            results=Results(args.memory),
             writes=args.allow_writes,
         )
         says = "are passed on" if args.allow_writes else "are refused (--allow-writes)"

@@ -25,14 +25,15 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
+from palpate.bridges.mqtt_broker import Broker
 from palpate.bridges.mqtt_content import discovery, state, verdict
-from palpate.bridges.mqtt_options import Broker
+from palpate.bridges.results import Results
 from palpate.bridges.source import COMMANDS, Source
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
 from palpate.core import wall_clock
 from palpate.core.clock import Clock
-from palpate.core.errors import AddressError, ApplianceError
+from palpate.core.errors import AddressError, ApplianceError, CommandRefused
 from palpate.core.log import SparseLog, log
 from palpate.core.retry import retried
 
@@ -72,7 +73,8 @@ class Waiting:
 
 
 class MqttBridge:
-    """Publishes the news of `source(heard)` at the broker, and takes commands if `writes`.
+    """Publishes the news of `source(heard)` at the broker, answers questions for `results`, and
+    takes commands if `writes`.
 
     name: of the box, in topics. stopped: whether the program is to end.
     """
@@ -85,11 +87,15 @@ class MqttBridge:
         clock: Clock,
         stopped: Callable[[], bool],
         *,
+        results: Results,
         writes: bool,
     ) -> None:
         self.dropped = 0
         self._broker, self._name, self._base = broker, name, f"palpate/{name}"
         self._clock, self._stopped, self._writes = clock, stopped, writes
+        self._results = results
+        # each at most once: a late START would be a wrong one
+        self._heeded = [(f"{self._base}/{one}", 0) for one in ("since", "command")[: 1 + writes]]
         self._log = SparseLog(clock.now_ns)
         self._lock = threading.Lock()
         self._waiting: deque[Waiting] = deque(maxlen=KEPT)
@@ -118,6 +124,7 @@ class MqttBridge:
         if isinstance(news, Answer):
             # both clocks now: the box's own time may be of another computer
             fields = {"time": wall_clock.date(), **verdict(news)}
+            self._results.add(wall_clock.seconds(), news)
             with self._lock:
                 self.dropped += len(self._waiting) == KEPT
                 self._waiting.append(Waiting(self._heard, self._clock.now_ns(), fields))
@@ -228,11 +235,7 @@ class MqttBridge:
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
         client.publish(f"homeassistant/device/palpate_{self._name}/config", config, 1, retain=True)
-        self._listen(client)
-
-    def _listen(self, client: paho.Client) -> None:
-        if self._writes:  # each at most once: a late START would be a wrong one
-            client.subscribe(f"{self._base}/command", qos=0)
+        client.subscribe(self._heeded)
 
     def _publish(self, client: paho.Client) -> None:
         """Send new verdicts, state and replies."""
@@ -251,7 +254,7 @@ class MqttBridge:
         self._say(client, "state", json.dumps(state(view, self.dropped)))
         if self._deaf_ns and now_ns >= self._deaf_ns:
             self._deaf_ns = 0
-            self._listen(client)
+            client.subscribe(self._heeded)
         while self._replies and not client.want_write():
             client.publish(f"{self._base}/reply", self._replies.popleft(), qos=0)
 
@@ -284,18 +287,18 @@ class MqttBridge:
             self._there = False
 
     def _command(self, client: Any, data: Any, message: paho.MQTTMessage) -> None:
-        """Begin a command; its reply comes later."""
-        if self._deaf_ns or self._flooded(client):
+        """Begin a command or a question; its reply comes later."""
+        if self._deaf_ns or self._flooded(client) or message.retain:
             return
-        name = message.payload[:16].decode("ascii", "replace").strip()
-        if message.retain or not self._writes:
-            return
-        if name not in COMMANDS:
-            self._reply(name, f"error: not a command; use {', '.join(COMMANDS)}")
+        text = message.payload[:40].decode("ascii", "replace").strip()
+        asks = message.topic.endswith("/since")
+        if not asks and text not in COMMANDS:
+            self._reply(text, f"error: not a command; use {', '.join(COMMANDS)}")
         elif not self._commanding.acquire(blocking=False):
-            self._reply(name, "error: another command is under way; send it again")
+            self._reply(text, "error: another command is under way; send it again")
         else:
-            threading.Thread(target=self._carry_out, args=(name,), daemon=True).start()
+            work = self._since if asks else self.source.send
+            threading.Thread(target=self._carry_out, args=(text, work), daemon=True).start()
 
     def _flooded(self, client: paho.Client) -> bool:
         """Count a command; after too many, ask the broker for no more."""
@@ -306,7 +309,7 @@ class MqttBridge:
         if self._commands <= MOST_COMMANDS:
             return False
         self._deaf_ns = math.inf  # until the broker has stopped
-        client.unsubscribe(f"{self._base}/command")
+        client.unsubscribe([topic for topic, _ in self._heeded])
         self._reply("", f"error: over {MOST_COMMANDS} commands in a second; pause for some seconds")
         self._log.warning("mqtt: a flood of commands; none is heard for some seconds")
         return True
@@ -314,18 +317,25 @@ class MqttBridge:
     def _deaf(self, client: Any, data: Any, mid: int, why: Any, more: Any) -> None:
         self._deaf_ns = self._clock.now_ns() + PAUSE_NS
 
-    def _carry_out(self, name: str) -> None:
+    def _carry_out(self, text: str, work: Callable[[str], Any]) -> None:
         try:
-            said = self.source.send(name)
+            said = work(text)
         except ApplianceError as e:
-            self._log.warning(f"mqtt: {name}: {e}")
+            self._log.warning(f"mqtt: {text}: {e}")
             said = f"error: {e}"
         finally:
             self._commanding.release()
-        self._reply(name, said)
+        self._reply(text, said)
 
-    def _reply(self, name: str, said: str) -> None:
-        self._replies.append(json.dumps({"command": name, "reply": said}))
+    def _since(self, text: str) -> list[Mapping[str, Any]]:
+        """The results since a time, the oldest first. Raises CommandRefused."""
+        try:
+            return self._results.since(wall_clock.read(text))
+        except (ValueError, OverflowError) as e:
+            raise CommandRefused(f"{e}; send a time such as 2026-11-28T14:00:00+01:00") from e
+
+    def _reply(self, text: str, said: object) -> None:
+        self._replies.append(json.dumps({"command": text, "reply": said}))
         self._wake()
 
 

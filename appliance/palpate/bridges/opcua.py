@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from asyncua.common.node import Node
 from asyncua.server.event_generator import EventGenerator
 
 from palpate import __version__
-from palpate.bridges.mqtt_options import read_login
 from palpate.bridges.opcua_model import (
     CODES,
     KINDS,
@@ -33,22 +31,21 @@ from palpate.bridges.opcua_model import (
 )
 from palpate.bridges.opcua_security import Login, hide_open_endpoint, limit, own_certificate
 from palpate.bridges.opcua_space import SmallServer
+from palpate.bridges.options import read_login
+from palpate.bridges.results import MOST, Results
 from palpate.bridges.server import CLOSE_S, not_listening
 from palpate.bridges.source import BoxView, Source
-from palpate.client import verdicts
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
 from palpate.core import wall_clock
 from palpate.core.clock import Clock
-from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, FeedError
+from palpate.core.errors import ApplianceError, CommandRefused, ConfigError
 from palpate.core.log import SparseLog
 
 URI = "urn:palpate:box"
 """Namespace of the nodes. A node's identifier is its path, the same on every box."""
-KEPT = 1000
-"""Results that wait to be written, and results that GetResults has without a file of verdicts."""
-MOST_RESULTS = 100
-"""Results of one call of GetResults."""
+WAITING = 1000
+"""Results that wait to be written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +75,11 @@ class OpcuaBridge:
                 "its second, or let everybody read with --anonymous"
             )
         self.address = ("", 0)
-        self._clock, self._offer, self._began_s = clock, offer, wall_clock.seconds()
+        self._clock, self._offer = clock, offer
         self._log = SparseLog(clock.now_ns)
         self._loop = asyncio.get_running_loop()
-        self._news: deque[tuple[float, Answer]] = deque(maxlen=KEPT)
-        self._ring: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._news: deque[tuple[float, Answer]] = deque(maxlen=WAITING)
+        self._results = Results(offer.memory)
         self._come, self._commanding = asyncio.Event(), asyncio.Lock()
         self._result: dict[str, Any] = {}
         self._at_s: float | None = None
@@ -214,8 +211,7 @@ class OpcuaBridge:
         self._at_s = at_s
         self._result = result(answer, view, at_s, self._start_s)
         self._start_s = None
-        row = {name: getattr(answer, name) for name in verdicts.COLUMNS if name != "at"}
-        self._ring.append({"at": at_s, **row})
+        self._results.add(at_s, answer)
         told = {f"LastResult.{name}": value for name, value in self._result.items()}
         await self._write(told, 0, at_s)
         if self._event:
@@ -273,16 +269,6 @@ class OpcuaBridge:
         most = numbers(given[1:], {"Most": 2**32})
         if isinstance(most, ua.CallMethodResult):
             return most
-        from_s = wall_clock.seconds_of(given[0].Value)
-        wanted = min(round(most[0]) or MOST_RESULTS, MOST_RESULTS)
-        rows = await asyncio.to_thread(self._rows, from_s, wanted)
+        from_s, wanted = wall_clock.seconds_of(given[0].Value), min(round(most[0]) or MOST, MOST)
+        rows = await asyncio.to_thread(self._results.since, from_s, wanted)
         return [ua.Variant([json.dumps(row) for row in rows], KINDS.String, is_array=True)]
-
-    def _rows(self, from_s: float, most: int) -> list[Mapping[str, Any]]:
-        """From the ring if it goes back so far, else from the file of verdicts."""
-        ring = [*self._ring]
-        first_s = ring[0]["at"] if len(ring) == KEPT else self._began_s
-        if from_s < first_s:
-            with suppress(FeedError):
-                return [*verdicts.since(self._offer.memory, from_s, most)]
-        return [*islice((row for row in ring if row["at"] >= from_s), most)]

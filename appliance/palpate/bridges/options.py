@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 
 from palpate.core.config import SerialConfig, StoreConfig
+from palpate.core.errors import ConfigError
 
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
@@ -100,3 +101,23 @@ def _number(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f"{text} is not a number of connections; use 1 to 1000")
     return int(text)
+
+
+def read_login(path: Path) -> tuple[str, str]:
+    """User and password. Raises ConfigError for a file that others may read, or without two
+    lines."""
+    try:
+        if path.stat().st_mode & 0o007:
+            raise ConfigError(
+                f"{path}: everybody may read the password; chmod o= {path}, and give it to "
+                "the bridge's user"
+            )
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as e:
+        why = str(getattr(e, "strerror", None) or "not a text").lower()
+        raise ConfigError(f"{path}: {why}; name a file with user and password") from e
+    if len(lines) < 2 or not lines[0]:
+        raise ConfigError(
+            f"{path}: it needs two lines; put the user on the first, the password on the second"
+        )
+    return lines[0], lines[1]

@@ -1,6 +1,6 @@
 """The serial line over TCP, for controllers with sockets, for example URScript. Each peer gets all
-sentences. Commands of the peers go to the box one at a time, and the answer goes to the peer that
-sent the command."""
+sentences. Commands of the peers go to the box one at a time, though not behind one that waits for
+the box's disk, and the answer goes to the peer that sent the command."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ PACE_S = 0.02
 """Least time between two commands to the box, of all peers together: its loop answers each, so a
 flood must not reach it. Also the least time between two commands of one peer, refused commands
 included, so that a flooding peer leaves the others their turn."""
-ANSWER_S = 2.0
-"""Longest wait for the box's answer to a command."""
+ANSWER_S, STORED_S = 2.0, 30.0
+"""Longest wait for the box's answer to a command, and to one of STORED."""
+STORED = ("DISCARD", "FORGET", "MOVE", "RENAME", "UNDO")
+"""Commands that the box answers once the change is on its disk; others it answers meanwhile."""
 QUESTIONS = ("ID", "STATE", "LABEL")
 """Commands that change nothing and need no permission."""
 
@@ -40,10 +42,10 @@ class TcpBridge:
     ) -> None:
         self.server = TcpServer(self.serve, most)
         self._to_peer = sentences.short if short else sentence
-        self._writes, self._loop, self._asking = writes, loop, asyncio.Lock()
+        self._writes, self._loop, self._pacing = writes, loop, asyncio.Lock()
+        self._asking = {stored: asyncio.Lock() for stored in (False, True)}
         self._next_s = 0.0  # earliest time of the next command to the box
-        self._asked = ""  # the command that the box has not answered yet
-        self._answer: asyncio.Future[bytes] = loop.create_future()
+        self._asked: dict[str, asyncio.Future[bytes]] = {}  # commands without an answer yet
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
     @property
@@ -64,8 +66,9 @@ class TcpBridge:
         line = self._to_peer(heard.kind, *heard.fields)
         # an answer that came too late, or that no peer has asked for, is dropped
         if heard.kind == "ANS":
-            if heard.fields[:1] == [self._asked] and not self._answer.done():
-                self._answer.set_result(line)
+            answer = self._asked.get("".join(heard.fields[:1]))
+            if answer and not answer.done():
+                answer.set_result(line)
             return
         for peer in [*self.server.peers]:
             peer.write(line)
@@ -85,20 +88,24 @@ class TcpBridge:
         if not why and not self._writes and command.kind not in QUESTIONS:
             why = "this bridge is read-only; start it with --allow-writes"
         if not why:
-            async with self._asking:
-                await asyncio.sleep(self._next_s - self._loop.time())
-                self._next_s = self._loop.time() + PACE_S
-                self._asked, self._answer = command.kind, self._loop.create_future()
+            stored = command.kind in STORED
+            limit_s = STORED_S if stored else ANSWER_S
+            async with self._asking[stored]:
+                async with self._pacing:
+                    await asyncio.sleep(self._next_s - self._loop.time())
+                    self._next_s = self._loop.time() + PACE_S
+                answer: asyncio.Future[bytes] = self._loop.create_future()
+                self._asked[command.kind] = answer
                 try:
                     await asyncio.to_thread(
                         self._line.write, sentence(command.kind, *command.fields)
                     )
-                    async with asyncio.timeout(ANSWER_S):
-                        return await self._answer
+                    async with asyncio.timeout(limit_s):
+                        return await answer
                 except LinkLost as e:
                     why = str(e)
                 except TimeoutError:
-                    why = f"the box has not answered within {ANSWER_S:g} s; check whether it is on"
+                    why = f"the box has not answered within {limit_s:g} s; check whether it is on"
                 finally:
-                    self._asked = ""
+                    del self._asked[command.kind]
         return self._to_peer("ANS", command.kind, "error", why)

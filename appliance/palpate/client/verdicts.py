@@ -43,16 +43,19 @@ clock. STRICT: SQLite would take a number of a wrong kind as bytes, which count 
 
 
 class VerdictFile:
-    """The file at `path`, ":memory:" for none, for its one writer. A file that is damaged is moved
-    aside. db: to read with the functions below. Raises TemporaryError if it cannot be opened."""
+    """The file at `path`, None for verdicts in memory alone, for its one writer. A file that is
+    damaged is moved aside. db: to read with the functions below. Raises TemporaryError if it cannot
+    be opened."""
 
-    def __init__(self, path: Path, *, most_mib: float = MOST_MIB) -> None:
+    def __init__(self, path: Path | None, *, most_mib: float = MOST_MIB) -> None:
         self._path, self._most, self._since = path, most_mib * (1 << 20), 0
         try:
             self.db = self._open()
         except sqlite3.OperationalError as e:
             raise TemporaryError(f"{path}: {e}; name a file in a folder of your own") from e
         except sqlite3.DatabaseError as e:
+            if path is None:
+                raise
             aside = path.with_suffix(".damaged")
             log.warning(f"{path}: {e}; it is kept as {aside}, and a new one begins")
             path.rename(aside)
@@ -96,8 +99,7 @@ class VerdictFile:
         """Raises sqlite3.DatabaseError."""
         # psow=0: a power cut in a write may spoil its whole sector, and with it the end of the
         # verdict before; so SQLite fills the sector
-        none = str(self._path) == ":memory:"
-        url = f"{'file::memory:' if none else self._path.absolute().as_uri()}?psow=0"
+        url = f"{self._path.absolute().as_uri() if self._path else 'file::memory:'}?psow=0"
         db = sqlite3.connect(url, timeout=WAIT_S, uri=True, check_same_thread=False)
         try:
             db.execute("PRAGMA journal_mode = WAL")

@@ -24,6 +24,12 @@ def seconds_of(date: datetime) -> float:
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
+def read(text: str) -> float:
+    """Seconds since 1970 of a date and time as text; without a zone it is in UTC. Raises
+    ValueError or OverflowError."""
+    return seconds_of(datetime.fromisoformat(text))
+
+
 def of(at_s: float, to: str = "seconds") -> str:
     """Seconds since 1970 as a date and time of this computer's zone, to the second."""
     return datetime.fromtimestamp(at_s).astimezone().isoformat(" ", to)

@@ -23,6 +23,7 @@ from palpate.core.errors import ConfigError
 from palpate.core.log import log
 
 TYPE = "_palpate._tcp.local."
+NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 LISTEN_S = 2.0
 """How long `found` waits for answers."""
 
@@ -35,6 +36,16 @@ class Reachable:
     kind: str
     host: str
     port: int
+
+
+def box_name(given: str) -> str:
+    """The box's name for other programs: as given, or the computer's. Raises ConfigError."""
+    name = given or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname())[:32]
+    if not NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name!r} is not a name of a box; use up to 32 letters, digits, hyphens, underscores"
+        )
+    return name
 
 
 def box_id() -> str:
@@ -68,8 +79,7 @@ def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], No
     except ImportError:
         log.info(f"{kind}: not announced; pip install 'palpate[found]'")
         return lambda: None
-    own = box_id()
-    box = re.sub(r"[^A-Za-z0-9-]", "-", name or socket.gethostname())[:32]
+    box = f"{box_name(name).replace('_', '-')}-{box_id()}"  # the name of a host has no underscore
     ended, opened = threading.Event(), []
 
     def work() -> None:
@@ -78,7 +88,7 @@ def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], No
             one = zeroconf.Zeroconf(zeroconf.InterfaceChoice.All if every else [host])
             opened.append(one)
             hosts = own_addresses() if every else [host]
-            one.register_service(_info(f"{box}-{own}", kind, hosts, port), allow_name_change=True)
+            one.register_service(_info(box, kind, hosts, port), allow_name_change=True)
         except (OSError, zeroconf.Error) as e:
             log.warning(f"{kind}: not announced ({e}); give its address to the clients")
         ended.wait()

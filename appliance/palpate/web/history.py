@@ -31,7 +31,7 @@ class History:
     this computer's zone. Raises ConfigError if these are no times."""
 
     def __init__(self, path: Path, shifts: str) -> None:
-        self._path, self._own = path, VerdictFile(Path(":memory:"), most_mib=OWN_MIB)
+        self._path, self._own = path, VerdictFile(None, most_mib=OWN_MIB)
         self._own_since_s = wall_clock.seconds()
         self._shifts = shifts
         try:

@@ -7,16 +7,20 @@ import socket
 import subprocess
 import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from palpate.bridges.mqtt_options import box_name, broker
+from palpate.bridges.mqtt_broker import broker
 from palpate.bridges.source import COMMANDS
-from palpate.core import retry
+from palpate.client.verdicts import VerdictFile
+from palpate.core import config, retry
 from palpate.core.errors import ConfigError
+from palpate.service.network import box_name
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.brokers import Mosquitto, Subscriber, TopicFlood, free_port, required
+from tests.factories.paths import NO_SITE
 from tests.factories.speaking_box import SpeakingBox, result, state
 
 mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
@@ -133,6 +137,30 @@ def test_commands_only_where_they_are_allowed(server, box):
                 eventually(lambda number=number: len(one.all("/reply")) == number)
     assert [e.kind for e in box.heard if e.kind in COMMANDS] == ["NEW", "START", "STOP"]
     assert ["error" in each["reply"] for each in one.all("/reply")] == [False, False, True, False]
+
+
+@pytest.mark.slow
+def test_results_that_a_client_missed(server, box, tmp_path, monkeypatch):
+    """Asked by time, also without --allow-writes, the bridge sends its results of this run; after a
+    restart of both it sends those of the file. A text that is no time is refused."""
+    file = tmp_path / "verdicts.db"
+    settings = config.load(None, [f"bridge.memory={file}"], site=NO_SITE)
+    monkeypatch.setattr(config, "load", lambda board: settings)
+    began = datetime.now(UTC)
+    rows = VerdictFile(file)
+    for number in range(1, 4):
+        rows.add(began.timestamp() + number / 1e6, {"sweep": number, "status": "ok", "label": "x"})
+    with Subscriber(server.port) as one, bridge("mqtt", *options(server, box)):
+        online(box, one)
+        for number, since in enumerate((began, datetime.now(UTC), None), 1):
+            box.say(result(10 + number))
+            eventually(lambda n=number: f'"sweep": {10 + n}' in one.last("/verdict"))
+            one.publish("palpate/b1/since", since.isoformat() if since else "yesterday")
+            eventually(lambda n=number: len(one.all("/reply")) == n)
+        before, now, wrong = (each["reply"] for each in one.all("/reply"))
+        assert [row["sweep"] for row in before] == [1, 2, 3]
+        assert [(row["sweep"], row["probability"]) for row in now] == [(11, 0.9), (12, 0.9)]
+        assert "yesterday" in wrong
 
 
 @pytest.mark.slow

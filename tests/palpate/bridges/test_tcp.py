@@ -275,7 +275,7 @@ def test_a_box_that_does_not_answer(monkeypatch):
         said = [await bridge._ask(Sentence("START"))]
         bridge._heard(Sentence("ANS", "START,ok", summed=True))
         asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
-        while bridge._asked != "STOP":
+        while "STOP" not in bridge._asked:
             await asyncio.sleep(0)
         bridge._heard(Sentence("ANS", "START,ok", summed=True))
         bridge._heard(Sentence("ANS", "STOP,ok", summed=True))
@@ -288,13 +288,46 @@ def test_a_box_that_does_not_answer(monkeypatch):
     assert right == sentence("ANS", "STOP", "ok")
 
 
+def test_a_command_that_waits_for_the_disk(monkeypatch):
+    """Another peer's question is answered before it, and it gets its own answer later than any
+    other command would; a second one waits for the first."""
+    monkeypatch.setattr(tcp, "ANSWER_S", 0.1)
+    monkeypatch.setattr(tcp, "PACE_S", 0.0)
+    port = DeafPort()
+
+    async def run() -> list[bytes]:
+        bridge = tcp.TcpBridge(
+            "x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop()
+        )
+        storing = [asyncio.create_task(bridge._ask(Sentence(kind))) for kind in ("DISCARD", "UNDO")]
+        while sentence("DISCARD") not in port.written:
+            await asyncio.sleep(0.01)
+        said = [await bridge._ask(Sentence("STATE"))]
+        asking = asyncio.create_task(bridge._ask(Sentence("LABEL")))
+        while "LABEL" not in bridge._asked:
+            await asyncio.sleep(0)
+        bridge._heard(Sentence("ANS", "LABEL,ok", summed=True))
+        said.append(await asking)
+        assert sentence("UNDO") not in port.written
+        bridge._heard(Sentence("ANS", "DISCARD,ok", summed=True))
+        said.append(await storing[0])
+        storing[1].cancel()
+        bridge.close()
+        return said
+
+    state, label, discard = asyncio.run(run())
+    assert b"ANS,STATE,error" in state
+    assert label == sentence("ANS", "LABEL", "ok")
+    assert discard == sentence("ANS", "DISCARD", "ok")
+
+
 def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
     """With 3.11's wait_for the bridge never ended."""
 
     async def run() -> bool:
         bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
         asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
-        while bridge._asked != "STOP":
+        while "STOP" not in bridge._asked:
             await asyncio.sleep(0)
         await asyncio.sleep(0.05)
         bridge._pass_on(Sentence("ANS", "STOP,ok", summed=True))

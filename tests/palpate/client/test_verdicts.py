@@ -58,7 +58,7 @@ def test_no_file_is_made_of_what_is_kept_in_memory(tmp_path, monkeypatch):
     """Each has rows of its own, which end with it."""
     monkeypatch.chdir(tmp_path)
     for sweep in (1, 2):
-        kept = VerdictFile(Path(":memory:"))
+        kept = VerdictFile(None)
         kept.add(NOW, verdict(sweep))
         assert [row["sweep"] for row in since(kept.db, NOW)] == [sweep]
         kept.close()
@@ -125,7 +125,7 @@ def test_wrong_kinds_are_refused(path, value):
 def test_in_memory(tmp_path, monkeypatch):
     """Without a file nothing is written to the folder of the program."""
     monkeypatch.chdir(tmp_path)
-    file = VerdictFile(Path(":memory:"))
+    file = VerdictFile(None)
     file.add(NOW, verdict(1))
     file.close()
     assert [*tmp_path.iterdir()] == []

@@ -26,7 +26,7 @@ def test_two_boxes_of_one_name(monkeypatch):
     ends = []
     for own, host in zip(("aaaaaa", "bbbbbb"), LOOPBACK, strict=True):
         monkeypatch.setattr(network, "box_id", lambda own=own: own)
-        ends += [network.announce(kind, host, port, "line 3") for kind, port in KINDS]
+        ends += [network.announce(kind, host, port, "line_3") for kind, port in KINDS]
     try:
         wanted = {
             network.Reachable(f"line-3-{own}", kind, host, port)

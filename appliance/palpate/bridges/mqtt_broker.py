@@ -1,17 +1,15 @@
-"""The broker of `palpate bridge mqtt`: its address, the file with the login, the box's name."""
+"""The broker of `palpate bridge mqtt`."""
 
 from __future__ import annotations
 
-import re
-import socket
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from palpate.bridges.options import read_login
 from palpate.core.errors import ConfigError
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
-NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,33 +45,3 @@ def broker(url: str, login: str, ca: str) -> Broker:
         raise ConfigError(f"--ca {ca}: there is no such file; name a file with certificates (PEM)")
     user, password = read_login(Path(login)) if login else ("", "")
     return Broker(host, port or PORTS[scheme], scheme == "mqtts", ca, user, password)
-
-
-def read_login(path: Path) -> tuple[str, str]:
-    """User and password. Raises ConfigError for a file that others may read, or without two
-    lines."""
-    try:
-        if path.stat().st_mode & 0o007:
-            raise ConfigError(
-                f"{path}: everybody may read the password; chmod o= {path}, and give it to "
-                "the bridge's user"
-            )
-        lines = path.read_text("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        why = str(getattr(e, "strerror", None) or "not a text").lower()
-        raise ConfigError(f"{path}: {why}; name a file with user and password") from e
-    if len(lines) < 2 or not lines[0]:
-        raise ConfigError(
-            f"{path}: it needs two lines; put the user on the first, the password on the second"
-        )
-    return lines[0], lines[1]
-
-
-def box_name(given: str) -> str:
-    """The box's name in topics: as given, or the computer's. Raises ConfigError."""
-    name = given or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname())[:32]
-    if not NAME.fullmatch(name):
-        raise ConfigError(
-            f"--name {name}: not a name; use up to 32 letters, digits, hyphens and underscores"
-        )
-    return name

@@ -1,0 +1,43 @@
+"""The results that a client of a bridge has missed: the newest from memory, older ones and those of
+before a restart from the file of verdicts (client/verdicts.py)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from palpate.client import verdicts
+from palpate.client.answers import Answer
+from palpate.core import wall_clock
+from palpate.core.errors import FeedError
+
+KEPT = 1000
+"""Results in memory."""
+MOST = 100
+"""Results of one question."""
+
+
+class Results:
+    """file: of verdicts, which `palpate bridge memory` writes; it may be missing."""
+
+    def __init__(self, file: Path) -> None:
+        self._file, self._began_s = file, wall_clock.seconds()
+        self._newest: deque[Mapping[str, Any]] = deque(maxlen=KEPT)
+
+    def add(self, at_s: float, answer: Answer) -> None:
+        """Keep a result. at_s: when it was heard, seconds since 1970."""
+        row = {name: getattr(answer, name) for name in verdicts.COLUMNS if name != "at"}
+        self._newest.append({"at": at_s, **row})
+
+    def since(self, from_s: float, most: int = MOST) -> list[Mapping[str, Any]]:
+        """The first `most` results since this time, in order, with the columns of the file."""
+        newest = [*self._newest]
+        first_s = newest[0]["at"] if len(newest) == KEPT else self._began_s
+        if from_s < first_s:
+            with suppress(FeedError):
+                return [*verdicts.since(self._file, from_s, most)]
+        return [*islice((row for row in newest if row["at"] >= from_s), most)]
