@@ -289,7 +289,7 @@ Heads = tuple[HeadPart, ...]
 @dataclass(frozen=True)
 class Candidates:
     """The heads to choose from. copies: whether all discriminants see augmented copies at first,
-    because the skin will be put back; for a skin in place none of eight sets chose them. loads:
+    because the skin will be put back; for a skin in place no set chose them. loads:
     whether held-out groups can show what loads are good for; the level of one session names its
     materials.
 
