@@ -124,43 +124,12 @@ def test_the_chart_has_findings_methods_gaps_and_the_processor():
     assert "5.0 points ahead" in development_report.caption(made)
 
 
-def test_a_chart_outside_of_a_page_needs_no_style_sheet():
-    """Its colours are plain, so that it is not black in a viewer that knows no variables."""
-    plain = development_report.front(figures(), plain=True)
-    assert "var(" not in plain
-    assert "<style" not in plain
-    assert "var(--accent" in development_report.front(figures())
-
-
 def test_the_picture_of_the_readme_names_at_most_seven_methods():
     """The line of our family, what ships, and the methods that a stranger would take otherwise."""
     named = re.findall(r">([^<>]+) \d+\.\d<", (ROOT / "docs/front.svg").read_text("utf-8"))
     assert {"ships", "Palpate", "MiniRocket", "MultiRocket-Hydra"} <= {*named}
     assert len({*named}) <= 7
     assert max(Counter(named).values()) <= 2  # once in each panel
-
-
-def test_names_do_not_collide():
-    """A name without room is left out, and no two names overlap."""
-    crowd = [f"method-{i:02}" for i in range(40)]
-    made = figures(
-        cases=[case("one")],
-        results=[entry("one", name, 0.8 + i / 1000) for i, name in enumerate(crowd)],
-        times=times(*(timed(name, 1 + i / 50) for i, name in enumerate(crowd))),
-    )
-    nodes = ElementTree.fromstring(development_report.front(made)).iter(f"{{{SVG}}}text")
-    boxes = []
-    for node in nodes:
-        if (text := node.text or "").startswith("method-"):
-            x, y, width = float(node.get("x", 0)), float(node.get("y", 0)), 4.5 * len(text)
-            side = re.search(r"text-anchor: (\w+)", node.get("style", ""))
-            left = x - {"start": 0, "middle": width / 2, "end": width}[side[1] if side else "start"]
-            boxes.append((left, y - 8, left + width, y))
-    assert 2 <= len(boxes) < 40
-    for i, a in enumerate(boxes):
-        assert not any(
-            a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3] for b in boxes[:i]
-        )
 
 
 def test_the_front_is_over_all_forms_of_methods_that_were_run_in_every_test():
@@ -324,15 +293,6 @@ def test_panels_are_timed_with_their_own_sweeps(tmp_path: Path, monkeypatch: pyt
     assert list(found) == [development_chart.SERIES]
     assert len(asked) == 1
     assert asked[0] < 1
-
-
-def test_networks_of_peers_are_trained_briefly_for_their_time():
-    """Our networks are trained in full, because their choices decide their speed."""
-    brief, whole = (
-        development_times._briefly(name, methods.FULL_EFFORT).effort
-        for name in ("ds-cnn", "palpate-bands")
-    )
-    assert (brief, whole) == ("200 iterations", methods.every()["palpate-bands"].effort)
 
 
 @pytest.mark.slow

@@ -139,13 +139,6 @@ def test_the_page_is_one_file_with_ours_and_the_printed_values(results: dict[str
     assert places == sorted(places)  # hard protocols first
 
 
-def test_a_plan_without_the_network_makes_a_page():
-    """Without the CNN its confusions are missing."""
-    page, pictures = paper_report.render(summary(cnn=False))
-    assert set(pictures) == {"figure-12"}
-    assert "CNN" in page
-
-
 def test_both_worlds_stand_side_by_side(results: dict[str, Any]):
     """The level-blind cases have their own sets; the difference is that of the table."""
     assert all("/level-blind:" in name for name in paper_experiment.FULL["hard/level-blind"].sets)

@@ -12,6 +12,7 @@ from palpate_train.answer import rules
 from palpate_train.data import sets
 from palpate_train.export import trial
 
+pytestmark = pytest.mark.slow  # the fixture answers each sweep without each rule
 SLIDES = "sim:T-REAL/level-blind:101:1"
 
 
@@ -57,7 +58,6 @@ def test_the_table_has_each_row(few: dict[tuple[str, ...], dict]):
     assert rows[1:] == [" and ".join(names) for names in list(few)[1:]]
 
 
-@pytest.mark.slow
 def test_the_command_writes_its_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """With slides of other places as displaced ones."""
     out = tmp_path / "rules.json"
