@@ -36,17 +36,13 @@ def test_only_the_normal_axis_of_several_counts():
     assert moved[0] == moved[1] != ""
 
 
-def test_without_contact_there_is_no_centre():
-    """Below the threshold, or where a skin gives no number: None, no displacement."""
+def test_loads_below_the_threshold_and_silent_taxels_have_no_weight():
+    """Without contact no centre or displacement; silent taxels at the rim are not filled in."""
     for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
         assert centre(counts(load), TARE, 5.0) is None
         assert displacement(counts(load).mean(axis=0), TARE, 5.0, MIDDLE).text == ""
     one = np.where(np.indices((4, 4)).sum(0) == 6, INF, patch(1.5, 1.5))
     assert centre(counts(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
-
-
-def test_pulled_and_silent_taxels_have_no_weight():
-    """With a tare loads may be negative; silent taxels at the rim are not filled in."""
     load = np.array([[-3.0, 0, 0, 0], [0, 50, 50, 0], [0, 50, 50, 0], [0, 0, 0, -3]])
     assert centre(counts(load), TARE, -10.0) == (1.5, 1.5)
     load = np.zeros((4, 4))

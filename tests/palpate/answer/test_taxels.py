@@ -71,48 +71,36 @@ def test_a_constant_taxel_is_silent(place, count, named):
         assert found(taxels, limits=replace(LIMITS, full_scale=250)) == named
 
 
-def test_one_axis_makes_the_taxel_broken():
-    """A constant shear axis is enough."""
+def test_a_taxel_is_broken_by_one_axis_in_enough_frames_of_a_moving_skin():
+    """A constant shear axis is enough; LEAST_FRAMES show noise; at rest all may be constant."""
     taxels = slide(axes=3)
     assert found(taxels) == ""
     taxels[:, 1, 1, 0] = 7
     assert found(taxels) == "silent taxel 2.2"
+    taxels = slide()
+    taxels[::2, 1, 1] = 200
+    assert found(taxels[:LEAST_FRAMES]) == "noisy taxel 2.2"
+    assert found(taxels[: LEAST_FRAMES - 1]) == ""
+    assert found(np.full((FRAMES, ROWS, COLS), 90, np.uint8)) == ""
+    nearly = np.full((FRAMES, ROWS, COLS), 90, np.uint8)
+    nearly[::300, 0, 0] += 1  # one that changes now and then shows no slide
+    assert found(nearly) == ""
 
 
-def test_a_noisy_taxel_is_one_that_is_noisier_than_its_neighbours():
-    """Three of them, two side by side; and a skin that is noisy all over has none."""
+def test_a_noisy_taxel_is_noisier_than_its_neighbours():
+    """Two side by side; not where all are noisy, and at rest not below the quietest sweep."""
     rng = np.random.default_rng(1)
     taxels, more = slide(), np.zeros((FRAMES, ROWS, COLS))
     more[:, [1, 1, 4], [1, 2, 4]] = 30 * rng.standard_normal((FRAMES, 3))
     assert found(np.clip(taxels + more, 0, 255).astype(np.uint8)) == "noisy taxel 2.2 2.3 5.5"
     everywhere = 20 * rng.standard_normal(taxels.shape)
     assert found(np.clip(taxels + everywhere, 0, 255).astype(np.uint8)) == ""
-
-
-def test_noise_at_rest_is_compared_with_the_quietest_training_sweep():
-    """Beside neighbours that are nearly silent, little noise does not make a taxel noisy."""
     rng = np.random.default_rng(1)
     taxels = 100 + 0.01 * rng.standard_normal((FRAMES, ROWS, COLS)).astype(np.float32)
     taxels[:, 1, 1] += rng.standard_normal(FRAMES).astype(np.float32)
     assert found(taxels) == ""
     taxels[:, 1, 1] *= 10
     assert found(taxels) == "noisy taxel 2.2"
-
-
-def test_few_frames_do_not_show_noise():
-    """The same taxel is noisy in one frame more."""
-    taxels = slide()
-    taxels[::2, 1, 1] = 200
-    assert found(taxels[:LEAST_FRAMES]) == "noisy taxel 2.2"
-    assert found(taxels[: LEAST_FRAMES - 1]) == ""
-
-
-def test_a_still_skin_has_no_silent_taxel():
-    """At rest and under a finger that does not slide, every taxel may be constant."""
-    assert found(np.full((FRAMES, ROWS, COLS), 90, np.uint8)) == ""
-    nearly = np.full((FRAMES, ROWS, COLS), 90, np.uint8)
-    nearly[::300, 0, 0] += 1  # one that changes now and then shows no slide
-    assert found(nearly) == ""
 
 
 def test_a_skin_whose_sound_taxels_may_be_constant():
@@ -153,8 +141,8 @@ def test_noise_is_measured_at_triples_of_frames():
     assert Window(ramp[:2]).noise.tolist() == [0]
 
 
-def test_a_broken_taxel_gets_the_mean_of_its_direct_neighbours():
-    """In the middle of four, and in a corner of two; the given counts stay."""
+def test_broken_taxels_are_bridged_by_their_neighbours():
+    """Their mean, or a line between the rows beside two; given counts and the range stay."""
     taxels = np.arange(9, dtype=np.uint8).reshape(1, 3, 3).repeat(4, axis=0)
     middle = np.zeros((3, 3), bool)
     middle[1, 1] = True
@@ -165,10 +153,6 @@ def test_a_broken_taxel_gets_the_mean_of_its_direct_neighbours():
     corner = np.zeros((3, 3), bool)
     corner[0, 0] = True
     assert (bridged(taxels, corner, np.zeros((3, 3)))[:, 0, 0] == 2).all()
-
-
-def test_broken_taxels_beside_each_other_are_interpolated():
-    """A broken row lies evenly between the rows beside it; two rows at a third and two thirds."""
     level = np.array([10, 20, 30, 40], float)[:, None] * np.ones((4, 3))
     taxels = np.tile(level, (2, 1, 1)).astype(np.int16)
     mask = np.zeros((4, 3), bool)
@@ -176,6 +160,9 @@ def test_broken_taxels_beside_each_other_are_interpolated():
     broken = taxels.copy()
     broken[:, 1:3] = -5
     assert (bridged(broken, mask, np.zeros((4, 3))) == taxels).all()
+    taxels = np.full((3, 1, 3), 250, np.uint8)
+    mask, unloaded = np.array([[True, False, False]]), np.array([[40.0, 0, 0]])
+    assert (bridged(taxels, mask, unloaded)[:, 0, 0] == 255).all()
 
 
 def test_the_level_of_an_unloaded_taxel_is_kept():
@@ -187,13 +174,6 @@ def test_the_level_of_an_unloaded_taxel_is_kept():
     broken = taxels.copy()
     broken[:, mask] = np.nan
     assert bridged(broken, mask, unloaded) == pytest.approx(taxels, rel=1e-6)
-
-
-def test_bridged_counts_stay_in_the_range_of_their_type():
-    """A sum above 255 becomes 255."""
-    taxels = np.full((3, 1, 3), 250, np.uint8)
-    mask, unloaded = np.array([[True, False, False]]), np.array([[40.0, 0, 0]])
-    assert (bridged(taxels, mask, unloaded)[:, 0, 0] == 255).all()
 
 
 @pytest.mark.parametrize(

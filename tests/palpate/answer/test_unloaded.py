@@ -39,11 +39,17 @@ def test_it_is_the_skin_that_nothing_touches(first):
     assert 5 < found.skin.contact < 40
 
 
-def test_a_finger_at_rest_is_not_taken_for_the_unloaded_skin():
-    """It is as quiet, but higher."""
+def test_rest_and_shear_are_not_taken_for_a_change():
+    """A finger at rest is as quiet, but higher; shear without a load is not a touch."""
     rest, lifted, slide = skin(700, 3), skin(500, 3, seed=2), skin(750, 30, seed=3)
     assert tracked(rest, slide, lifted, rest).skin.level.mean() == pytest.approx(500, abs=3)
     assert tracked(lifted, rest, slide).skin.level.mean() == pytest.approx(500, abs=3)
+    frames = skin(500, 3, 400, shape=(4, 4, 3))
+    frames[200:, ..., :2] += 400
+    format = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
+    assert not tracked(frames, format=format).certain
+    frames[200:, ..., 2] += 400
+    assert tracked(frames, format=format).certain
 
 
 @pytest.mark.parametrize("noise", [3, 40])
@@ -63,15 +69,11 @@ def test_a_tare_is_certain_and_stays():
     assert (tracker.skin, tracker.certain) == (None, False)
 
 
-def test_whole_counts_have_a_least_difference():
-    """With noise below a count, two are a load; fractions have no such limit."""
+def test_the_threshold_is_above_the_noise_of_sound_taxels():
+    """Two whole counts at least; taxels without a number or too noisy do not count."""
     still = np.full((50, 4, 4), 7, np.uint8)
     assert UnloadedSkin.measured(still).contact == 2
     assert UnloadedSkin.measured(still.astype(np.float32)).contact == 0
-
-
-def test_broken_taxels_do_not_count():
-    """Without a number or far noisier than others, they do not change the threshold."""
     frames = skin(500, 3).astype(np.float32)
     whole = UnloadedSkin.measured(frames).contact
     frames[:, 0, 0] = np.nan
@@ -81,13 +83,3 @@ def test_broken_taxels_do_not_count():
         frames, skin(800, 40).astype(np.float32), format=SweepFormat(4, 4, 100.0, 200, "float32")
     )
     assert tracker.certain
-
-
-def test_several_axes_are_judged_by_the_normal_one():
-    """Shear that varies without a load along the normal is not a touch."""
-    frames = skin(500, 3, 400, shape=(4, 4, 3))
-    frames[200:, ..., :2] += 400
-    format = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
-    assert not tracked(frames, format=format).certain
-    frames[200:, ..., 2] += 400
-    assert tracked(frames, format=format).certain

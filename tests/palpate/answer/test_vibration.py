@@ -18,18 +18,14 @@ def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
     return (TARE + load + swing[:, None, None]).astype(np.float32)
 
 
-def test_it_is_the_deviation_over_the_load():
-    """Whatever the gain; a quarter of a count on a million is measured, too."""
+def test_it_is_the_deviation_over_the_load_along_the_normal():
+    """Whatever gain and shear; a quarter of a count on a million is measured, too."""
     want = [math.log(1 / 50), math.log(4 / 50)]
     assert vibration(window(1, 4), TARE, 2) == pytest.approx(want, abs=1e-3)
     strong = TARE + 10 * (window(1, 4) - TARE)
     assert vibration(strong, TARE, 2) == pytest.approx(want, abs=1e-3)
     small = vibration(window(0.25, 0.25, load=1e6), TARE, 2)
     assert small == pytest.approx([math.log(0.25 / 1e6)] * 2, abs=0.01)
-
-
-def test_only_the_normal_axis_counts():
-    """Large shear changes nothing."""
     axes = np.stack([100 * window(5, 5), window(1, 4)], axis=-1)
     tare = np.stack([TARE, TARE], axis=-1)
     assert vibration(axes, tare, 2) == pytest.approx(vibration(window(1, 4), TARE, 2))

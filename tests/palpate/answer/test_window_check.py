@@ -48,12 +48,17 @@ def test_a_spoiled_window_is_named(place, value, status, detail):
         assert inspect(taxels, BARE, replace(LIMITS, dead_taxels=1)).status is Status.OK
 
 
-def test_the_share_of_full_counts_is_measured():
-    """Of a window that is accepted."""
+def test_full_counts_and_windows_without_a_threshold():
+    """The share of full counts of an accepted window; without a threshold all are loaded."""
     taxels = moving()
     taxels[:150, 0, 1] = 255
     found = inspect(taxels, BARE, replace(LIMITS, saturated=0.1))
     assert (found.status, found.full) == (Status.OK, 1 / 32)
+    unknown = replace(LIMITS, contact=None)
+    assert inspect(moving(6), BARE, unknown).status is Status.OK
+    taxels = moving()
+    taxels[:, 1, 2] = 0
+    assert inspect(taxels, BARE, unknown).status is Status.STUCK_TAXEL
 
 
 def test_an_amplifier_that_clips_below_full_scale():
@@ -80,15 +85,6 @@ def test_an_amplifier_that_clips_below_full_scale():
     numbers = moving().astype(np.float32)
     numbers[0, 0, 0] = np.nan
     assert clips(numbers) == 255
-
-
-def test_without_a_threshold_every_taxel_counts_as_loaded():
-    """No window is without contact; a taxel that is still is stuck, as everywhere in a contact."""
-    unknown = replace(LIMITS, contact=None)
-    assert inspect(moving(6), BARE, unknown).status is Status.OK
-    taxels = moving()
-    taxels[:, 1, 2] = 0
-    assert inspect(taxels, BARE, unknown).status is Status.STUCK_TAXEL
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

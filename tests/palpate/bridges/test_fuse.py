@@ -96,8 +96,8 @@ def test_each_finger_answers_then_the_hand(fingers):
         assert (hand.label, hand.status, own[0].probability) == ("wood", "ok", 0.6)
 
 
-def test_labels_are_fused_by_name(two):
-    """The second bundle has the same labels in another order."""
+def test_bundles_are_compared_by_label_and_id(two):
+    """In another order of labels; one id together, which changes with each."""
     turned = [*reversed(LABELS)]
     two.take("right", feed_lines.hello(labels=turned), feed_lines.health(0))
     verdict = scored({"wood": 0.8})
@@ -105,6 +105,9 @@ def test_labels_are_fused_by_name(two):
     two.take("right", verdict | {"scores": verdict["scores"][::-1]})
     assert two.said[-1].label == "wood"
     assert two.said[-1].probability > 0.9
+    assert common(["aa", "aa"]) == "aa"
+    assert common([]) == ""
+    assert len({common(ids) for ids in (["aa", "bb"], ["aa", "bc"], ["ab", "bb"])}) == 3
 
 
 UNKNOWN = {**FAULT, "status": "unknown"}
@@ -208,13 +211,6 @@ def test_commands(two):
     assert asked("$PPLP,LABEL,9")[:2] == ["LABEL", "error"]
     assert asked("$PPLP,STATE")[:2] == ["STATE", "ok"]
     assert asked("$PPLP,TARE")[:2] == ["TARE", "error"]
-
-
-def test_bundles_have_one_id_together():
-    """The common one; of different bundles one that changes with each."""
-    assert common(["aa", "aa"]) == "aa"
-    assert common([]) == ""
-    assert len({common(ids) for ids in (["aa", "bb"], ["aa", "bc"], ["ab", "bb"])}) == 3
 
 
 @pytest.mark.parametrize(

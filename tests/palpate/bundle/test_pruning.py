@@ -56,20 +56,16 @@ def test_what_only_early_heads_need_is_gone(default_bundle):
     assert len(pruned) < 0.95 * len(default_bundle.model)
 
 
-def test_what_is_left_passes_the_check(default_bundle):
-    """The check accepts a pruned model as the model of a bundle without early heads."""
+def test_a_pruned_model_passes_the_check_and_a_plain_one_stays(default_bundle):
+    """As the model of a bundle without early heads; without other outputs no byte changes."""
+    model = toy_bundle.model(("logits", "embedding"))
+    assert "early" in [name for node in reader.read(model).graph.node for name in node.output]
+    assert prune(model, {"embedding", "logits"}) is model
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     manifest = default_bundle.manifest
     check.check(pruned, replace(manifest, early=None))
     with pytest.raises(BundleError, match="manifest"):
         check.check(pruned, manifest)
-
-
-def test_a_model_without_other_outputs_stays_as_it_is():
-    """The bytes are the same, even if the result of a node is not used."""
-    model = toy_bundle.model(("logits", "embedding"))
-    assert "early" in [name for node in reader.read(model).graph.node for name in node.output]
-    assert prune(model, {"embedding", "logits"}) is model
 
 
 def test_declarations_of_what_is_gone_are_gone():

@@ -17,8 +17,8 @@ def chip() -> gpio.SimGpio:
     return gpio.SimGpio(rig.VirtualClock(), {"/dev/gpiochip0": [f"GPIO{i}" for i in range(28)]})
 
 
-def test_all_outputs_are_requested_low_and_given_back(chip, monkeypatch):
-    """Each once, at its low level, and released; inputs stay."""
+def test_all_outputs_are_requested_low_and_given_back(chip, monkeypatch, capsys):
+    """Each once, at its low level, and released; inputs stay; without a board nothing."""
     asked = []
     request = chip.request_lines
     monkeypatch.setattr(
@@ -39,10 +39,6 @@ def test_all_outputs_are_requested_low_and_given_back(chip, monkeypatch):
     assert settings.direction is chip.line.Direction.OUTPUT
     assert settings.output_value is chip.line.Value.INACTIVE
     assert chip.requests == []
-
-
-def test_a_box_without_lines_has_nothing_to_lower(chip, capsys):
-    """Without a board the command touches no line and prints nothing."""
     assert lower_outputs.main(["--set", "output.ready="], chip) == 0
     assert capsys.readouterr() == ("", "")
 

@@ -65,15 +65,11 @@ def test_later_layers_win_and_each_value_knows_its_source(folder):
     assert len(c.sources) == 1 + sum(len(schema.keys(type(getattr(c, s)))) for s in sections)
 
 
-def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder):
-    """`board = "a"` in palpate.toml, then --board b over it."""
+def test_a_board_is_named_by_file_or_option_or_not_at_all(folder, tmp_path):
+    """--board wins over palpate.toml; without either, the defaults wire no line."""
     (folder / "palpate.toml").write_text('board = "a"\n')
     assert (_load(folder).trigger.start, _load(folder).sources["board"]) == ("L1", "palpate.toml")
     assert (_load(folder, "b").trigger.start, _load(folder, "b").output.ready) == ("", "L9")
-
-
-def test_without_a_board_and_files_no_line_is_wired(tmp_path):
-    """Without skin.toml the defaults apply, and no line is wired."""
     (tmp_path / "palpate.toml").write_text("")
     c = _load(tmp_path)
     assert set(c.sources.values()) == {"code"}

@@ -44,16 +44,12 @@ def test_the_journal_is_known_by_its_stream(tmp_path):
     assert not in_journal(environ, 1_000_000)
 
 
-def test_one_line_on_standard_error_however_often_it_is_set_up(capsys):
-    """Two commands in one process print each line once."""
+def test_a_line_comes_once_or_not_at_all(capsys, monkeypatch):
+    """However often it is set up; a full disk raises and prints nothing else."""
     to_stderr()
     to_stderr()
     log.info("ready")
     assert capsys.readouterr().err == "palpate: ready\n"
-
-
-def test_a_full_disk_costs_the_line_alone(monkeypatch):
-    """Standard error that cannot be written: nothing is raised, nothing else is printed."""
     to_stderr()
     full = open("/dev/full", "w")  # noqa: SIM115 (its close fails, too)
     monkeypatch.setattr(sys, "stderr", full)

@@ -41,12 +41,16 @@ def test_a_service_tries_again_with_a_growing_pause(monkeypatch, logged):
     assert len(logged) == 1
 
 
-def test_a_person_is_told_at_once():
-    """In a terminal the error ends the command."""
+def test_only_a_service_waits_for_errors_that_pass():
+    """A full disk or too many files; in a terminal the error ends the command."""
     clock, calls, make = refusing(1)
     with pytest.raises(AddressError):
         retry.retried(make, clock)
     assert len(calls) == 1
+    passing = [OSError(n, "") for n in (errno.ENOSPC, errno.EMFILE, errno.EIO, errno.ENOMEM)]
+    staying = [OSError(n, "") for n in (errno.ENOENT, errno.EACCES, errno.EROFS)]
+    assert all(map(errors.passes, passing))
+    assert not any(map(errors.passes, [*staying, ValueError("x")]))
 
 
 def test_a_stop_ends_the_wait(monkeypatch):
@@ -57,14 +61,6 @@ def test_a_stop_ends_the_wait(monkeypatch):
     with pytest.raises(AddressError):
         retry.retried(make, clock, lambda: clock.now_ns() > end_ns)
     assert clock.now_ns() - end_ns < SECOND
-
-
-def test_which_errors_pass():
-    """A full disk and too many files pass; a missing file and a missing right do not."""
-    passing = [OSError(n, "") for n in (errno.ENOSPC, errno.EMFILE, errno.EIO, errno.ENOMEM)]
-    staying = [OSError(n, "") for n in (errno.ENOENT, errno.EACCES, errno.EROFS)]
-    assert all(map(errors.passes, passing))
-    assert not any(map(errors.passes, [*staying, ValueError("x")]))
 
 
 def test_how_a_command_ends():

@@ -28,16 +28,12 @@ def test_all_that_is_said_of_a_status_is_of_the_table():
     assert shown == {s: [w.colour, w.word, w.advice] for s, w in WORDS.items()}
 
 
-def test_every_reason_of_a_rule_has_words():
-    """With a place for each of its numbers."""
+def test_the_table_is_whole():
+    """All but `ok` have words, also each reason with its numbers; only `ok` is used."""
     assert set(DETAILS) == set(Reason)
     remark = Remark(Reason.UNLIKE_ALL, {"distance": 41.25, "label": "wood", "limit": 30.0})
     assert [part in remark.text for part in ("41.25", "wood", "30")] == [True] * 3
     assert "sweep 7" in Remark(Reason.UNLIKE_ALL_AGAIN, remark.numbers | {"sweep": 7}).text
-
-
-def test_the_table_is_whole():
-    """No label has a reason; all but `ok` have words; only `ok` is used."""
     assert set(REASONS) == {s for s in Status if not s.classified}
     assert all(w.word and w.advice for s, w in WORDS.items() if s is not Status.OK)
     assert [s for s, w in WORDS.items() if w.robot == USE] == [Status.OK]

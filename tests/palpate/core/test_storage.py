@@ -10,11 +10,14 @@ import pytest
 from palpate.core import storage
 
 
-def test_folders_are_made_once(tmp_path):
-    """`parents` makes the folders that are missing, and takes those that are there."""
+def test_folders_are_made_once_and_a_failed_exchange_says_why(tmp_path):
+    """With missing parents; the system's error arrives with number and name."""
     for name in ("a", "b"):
         storage.put(tmp_path / "one" / "two" / name, name.encode(), parents=True)
     assert sorted(os.listdir(tmp_path / "one" / "two")) == ["a", "b"]
+    with pytest.raises(FileNotFoundError) as e:
+        storage.exchange(tmp_path, tmp_path / "none")
+    assert (e.value.errno, e.value.filename) == (errno.ENOENT, str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize("durable", [True, False])
@@ -32,10 +35,3 @@ def test_what_could_not_be_written(tmp_path):
     assert "folder" in storage.refused(tmp_path)
     assert "folder" in storage.refused(tmp_path / "none" / "file")
     assert not storage.refused(tmp_path / "file")
-
-
-def test_a_failed_exchange_says_why(tmp_path):
-    """The error of the system call arrives with its number and the name."""
-    with pytest.raises(FileNotFoundError) as e:
-        storage.exchange(tmp_path, tmp_path / "none")
-    assert (e.value.errno, e.value.filename) == (errno.ENOENT, str(tmp_path / "none"))

@@ -49,8 +49,8 @@ def test_an_install_makes_a_private_key_once(key):
     key.verify(DATA, key.sign(DATA))
 
 
-def test_two_boxes_do_not_believe_each_other(key, tmp_path):
-    """Of another box, data or use, or cut: refused."""
+def test_a_signature_is_for_one_box_and_use(key, tmp_path):
+    """Another box, data or use, or cut: refused; never for bundles, whatever the signers say."""
     other = install_scripts.enrolment_key(tmp_path / "other")
     assert (other.folder / KEY).read_bytes() != (key.folder / KEY).read_bytes()
     good = key.sign(DATA)
@@ -65,10 +65,6 @@ def test_two_boxes_do_not_believe_each_other(key, tmp_path):
         with pytest.raises(BundleError, match="enrolled"):
             key.verify(data, signed)
     key.verify(DATA, good)
-
-
-def test_the_key_signs_no_bundle(key, tmp_path):
-    """Even if an administrator adds its line to the signers of bundles."""
     signers = tmp_path / "allowed_signers"
     signers.write_text((key.folder / SIGNER).read_text())
     for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):

@@ -89,8 +89,8 @@ def test_the_new_bundle_runs(old, tmp_path):
     assert it(toy_bundle.sweep(-30, 0)).status is Status.UNKNOWN
 
 
-def test_a_material_that_scatters_is_kept(old):
-    """Its sweeps and an assumed one: (2 + 4 * 9) / (2 * 4)."""
+def test_a_label_has_the_spread_and_the_median_of_its_sweeps(old):
+    """With an assumed sweep: (2 + 4 * 9) / (2 * 4); the golden sweep is the median one."""
     new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
     assert new.bundle.classes is not None
     assert new.bundle.classes.spread[3] == pytest.approx(38 / 8, abs=1e-4)
@@ -98,10 +98,6 @@ def test_a_material_that_scatters_is_kept(old):
     edge = np.sqrt(9 * 38 / 8 * 5 / 4)
     assert it(toy_bundle.sweep(20 + edge - 0.1, 20)).label == "felt"
     assert it(toy_bundle.sweep(20 + edge + 0.1, 20)).status is Status.UNKNOWN
-
-
-def test_the_golden_sweep_is_the_median_of_those_recognised(old):
-    """The median of the new label's probability, over the sweeps that get the new label."""
     near = [(3.0, 5.0), (3.0, 5.5), (4.0, 8.0), (3.2, 6.0), (0.5, 6.0)]
     new = enrolment.enrol(old, "felt", counts(*near))
     it = Classifier(new.bundle, VirtualClock())
@@ -220,11 +216,15 @@ def test_labels_that_cannot_be_enrolled(old, label):
             refused(old, label)
 
 
-def test_a_bundle_without_embedding(tmp_path):
-    """A bundle without class means is refused."""
+def test_bundles_and_sweeps_without_numbers_are_refused(tmp_path):
+    """Without class means, and with a mean that is NaN, which would spoil every answer."""
     plain = toy_bundle.load(tmp_path / "p", known=None, outputs=("logits",))
     with pytest.raises(BundleError, match="embedding"):
         enrolment.enrol(plain, "felt", counts((7, 8)))
+    format = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.load(tmp_path / "f", format=format)
+    with pytest.raises(FormatError, match="number"):
+        enrolment.enrol(made, "felt", np.full((1, 20, 2, 2), 3e38, np.float32))
 
 
 @pytest.mark.parametrize(
@@ -235,11 +235,3 @@ def test_sweeps_of_another_format(old, sweeps):
     """Sweeps with a dimension too few, no sweeps, another window, another type."""
     with pytest.raises(FormatError, match="enrolled"):
         enrolment.enrol(old, "felt", sweeps)
-
-
-def test_sweeps_that_give_no_number(tmp_path):
-    """A mean that is NaN would make every later answer invalid."""
-    format = replace(toy_bundle.FORMAT, dtype="float32")
-    made = toy_bundle.load(tmp_path / "f", format=format)
-    with pytest.raises(FormatError, match="number"):
-        enrolment.enrol(made, "felt", np.full((1, 20, 2, 2), 3e38, np.float32))

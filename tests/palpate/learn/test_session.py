@@ -111,11 +111,14 @@ def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught):
     assert not about["trouble"]
 
 
-def test_faulty_sweeps_do_not_count(taught):
-    """They are stored, and neither counted nor taught."""
+def test_sweeps_without_a_fault_of_two_materials_are_needed(taught):
+    """Faulty ones are stored, neither counted nor taught; one material is refused."""
     taught.sweeps("cork", 2)
     taught.sweeps("cork", 2, Status.NO_CONTACT)
     assert taught.session.materials() == {"cork": 2}
+    taught.sweeps("cork", 5)
+    with pytest.raises(ApplianceError, match=r"1 materials"):
+        taught.order("USE")
 
 
 def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught):
@@ -234,13 +237,6 @@ def test_a_process_that_hangs_is_killed(quiet_s, why):
     while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
         assert time.monotonic() < end
         time.sleep(0.02)
-
-
-def test_use_needs_two_materials(taught):
-    """A single material has nothing to be confused with; the message names the remedy."""
-    taught.sweeps("cork", 5)
-    with pytest.raises(ApplianceError, match=r"1 materials"):
-        taught.order("USE")
 
 
 @pytest.mark.parametrize("label", ["", " ", "käse", "a,b", "x" * 25])

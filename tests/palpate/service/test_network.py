@@ -47,14 +47,10 @@ def test_two_boxes_of_one_name(monkeypatch):
 KINDS = (("page", 8137), ("opcua", 4840))
 
 
-def test_a_box_that_is_not_open_says_nothing(monkeypatch):
-    """No socket is opened for an address of this machine alone."""
+def test_the_id_is_stable_and_a_closed_box_says_nothing(monkeypatch):
+    """Six letters; no socket is opened for an address of this machine alone."""
     monkeypatch.setattr(socket, "socket", None)
     for host in ("127.0.0.1", "::1"):
         assert network.announce("tcp", host, 1503)() is None
-
-
-def test_the_id_is_stable():
-    """Six letters, the same each time."""
     assert network.box_id() == network.box_id()
     assert len(network.box_id()) == 6

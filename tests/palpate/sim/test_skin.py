@@ -147,15 +147,11 @@ def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect):
     assert alike > 0.9  # not 1: each of the four is rounded to whole digits
 
 
-def test_noise_alone_is_white_and_has_its_standard_deviation():
-    """Plus that of rounding; by taxel."""
+def test_noise_is_white_and_vibration_common():
+    """Noise by taxel, plus rounding; vibration is one signal in proportion to pressure."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
     assert taxels.std(0).mean() == pytest.approx(np.hypot(World().noise_counts, 12**-0.5), rel=0.05)
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
-
-
-def test_vibration_alone_shakes_all_taxels_together_by_their_pressure():
-    """Friction adds one signal to all taxels, in proportion to their pressure."""
     loud = replace(only("vibration"), counts_per_kpa=25.0)
     taxels = skin.window("plastic rough", PLACE, rng(), loud).reshape(-1, 16).astype(float)
     assert np.corrcoef(taxels.T).min() > 0.95
@@ -163,8 +159,8 @@ def test_vibration_alone_shakes_all_taxels_together_by_their_pressure():
     assert share.max() / share.min() < 1.1
 
 
-def test_the_pad_damps_vibration_more_further_forward():
-    """A skin one row forward gets less of the high vibrations than one in the middle."""
+def test_further_forward_there_is_less_vibration_and_higher_relief():
+    """One row forward: damped high vibrations; the same relief, higher as the World says."""
     power = []
     for dx_mm in (0.0, skin.PITCH_MM):
         frames = skin.window("metal", Placement(dx_mm), rng(), only("position", "vibration"))[
@@ -172,10 +168,6 @@ def test_the_pad_damps_vibration_more_further_forward():
         ].astype(float)
         power.append(frames.std(0).mean() / frames.mean())
     assert power[1] < 0.75 * power[0]
-
-
-def test_the_relief_is_higher_further_forward():
-    """A skin one row forward gets the same relief higher, by as much as the World says for 4 mm."""
     tube, felt = World().tube("plastic rough"), []
     for dx_mm in (0.0, skin.PITCH_MM):
         x = skin.position(Placement(dx_mm), World())[0]

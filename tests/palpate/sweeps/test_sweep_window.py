@@ -195,19 +195,8 @@ def test_a_start_with_lost_edges_gets_one_answer(ready):
     assert [sweep.status for sweep in bench.done()] == [want]
 
 
-def test_objects_are_counted():
-    """NEW OBJECT numbers the sweeps that start after it."""
-    bench = Bench()
-    bench.put(frames(0, 3000))
-    for begin in (0, 700):
-        bench.edge(START, begin)
-        bench.edge(EdgeKind.NEW_OBJECT, begin + 5)
-        bench.edge(STOP, begin + 1600)
-    assert [s.object for s in bench.done()] == [0, 1]
-
-
 def test_the_ring_overwrites_only_old_frames():
-    """After many turns of the ring a window is still cut correctly."""
+    """After many turns a window is right, and its first frame has its neighbour before it."""
     bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
         bench.put(frames(first, 750))
@@ -216,24 +205,27 @@ def test_the_ring_overwrites_only_old_frames():
     (sweep,) = bench.done()
     assert (sweep.frames.seq == np.arange(27_250, 28_750)).all()
     assert (sweep.frames.taxels == numbered(30_000)[27_250:28_750]).all()
-
-
-def test_a_window_as_old_as_the_ring_has_its_neighbours():
-    """A missing first frame of the oldest window is interpolated from the frame before it."""
     ring = FrameRing(FMT, seconds=1)
     ring.put(frames(0, round(FMT.rate_hz) + FMT.window + 2 * MAX_GAP, drop=(MAX_GAP,)))
     window, missing = ring.window(MAX_GAP, FMT.window)
     assert (len(window), missing) == (FMT.window, (0,))
 
 
-def test_latest_is_complete_or_none():
-    """The newest frames, or None if a frame is missing."""
+def test_objects_are_counted_and_the_latest_is_complete():
+    """NEW OBJECT numbers later sweeps; the newest frames, or None where one is missing."""
     bench = Bench()
     assert bench.recorder.latest(10) is None
     bench.put(frames(0, 100))
     assert (bench.recorder.latest(10) == numbered(100)[90:]).all()
     bench.put(frames(101, 3))
     assert bench.recorder.latest(10) is None
+    bench = Bench()
+    bench.put(frames(0, 3000))
+    for begin in (0, 700):
+        bench.edge(START, begin)
+        bench.edge(EdgeKind.NEW_OBJECT, begin + 5)
+        bench.edge(STOP, begin + 1600)
+    assert [s.object for s in bench.done()] == [0, 1]
 
 
 @pytest.mark.parametrize("packet", [1, 6, 40, 1000])
