@@ -12,13 +12,16 @@ from palpate_train.onnx_tools.quantize import quantize
 from tests.factories.loud_model import loudness, sweeps
 
 
-def test_weights_and_multiply_accumulates_are_counted():
-    """A graph with sums by hand. int8 counts the same; scales and zero points are not weights."""
+def test_weights_products_and_transforms_are_counted():
+    """By hand; int8 the same, scales are no weights; L and H have their transforms."""
     plain, whole = loudness(), quantize(loudness(), sweeps().samples)
     assert cost.precision(plain) == "float"
     assert cost.precision(whole) == "int8"
     assert cost.macs(plain) == cost.macs(whole) == 39 * 3 * 4 * 2 + 3 * 2
     assert cost.weights(plain) == cost.weights(whole) == 3 * 4 * 2 + 3 + 3 * 2 + 2
+    assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
+    assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
+    assert cost.feature_macs("raw", skin.FORMAT) == 0
 
 
 def test_a_gru_a_kernel_and_neighbours_are_counted():
@@ -53,10 +56,3 @@ def test_a_graph_of_unknown_shapes_is_refused():
     model = helper.make_model(helper.make_graph([node], "g", [x], [y], [w]))
     with pytest.raises(FormatError, match=r"'product'.*'x' is not"):
         cost.macs(model)
-
-
-def test_the_transforms_of_features_are_counted():
-    """L has one transform of 1500 frames a taxel, H 40 of 75; raw counts have none."""
-    assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
-    assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
-    assert cost.feature_macs("raw", skin.FORMAT) == 0

@@ -132,8 +132,8 @@ def test_the_picture_of_the_readme_names_at_most_seven_methods():
     assert max(Counter(named).values()) <= 2  # once in each panel
 
 
-def test_the_front_is_over_all_forms_of_methods_that_were_run_in_every_test():
-    """A float form may be on it where the int8 form is not. Of equal times the better counts."""
+def test_the_front_is_over_all_forms_and_the_line_over_our_family():
+    """A float form may be on it; of equal times the better; the packaged recipe is a size."""
     slow, quick = spot("ds-cnn", 0.3, 0.85), spot("ds-cnn", 0.1, 0.8, "int8")
     ours, gap = spot("palpate", 0.4, 0.9), spot("lite", 0.05, 0.99, lacks=("one",))
     worse, later = spot("quant", 0.1, 0.7), spot("minirocket", 10.0, 0.9)
@@ -143,10 +143,6 @@ def test_the_front_is_over_all_forms_of_methods_that_were_run_in_every_test():
     assert made.lacking() == {"lite": 1}
     assert panel().front == []
     assert "not run in every test" in development_chart.finding(panel())
-
-
-def test_the_line_is_the_front_of_our_family():
-    """The packaged recipe counts as one of its sizes."""
     bands, everything = spot("palpate-bands", 0.1, 0.7), spot("palpate", 0.4, 0.9)
     packaged = spot("palpate-reattached", 0.01, 0.85)
     made = panel(everything, bands, packaged, spot("quant", 50.0, 0.95))
@@ -194,15 +190,6 @@ def test_a_panel_has_the_times_of_its_own_sweeps():
     assert any("16x1 taxels, 128 frames" in text for text in texts(development_report.front(made)))
 
 
-def test_times_are_told_in_those_of_minirocket():
-    """The unit is MiniRocket's quickest time. Without it times are not compared."""
-    costs = [timed("minirocket", ms) for ms in (12.0, 10.0)]
-    costs += [timed("palpate", 0.1), timed("quant", 22.0)]
-    names = ["palpate", "quant", "ds-cnn"]
-    assert development_chart.relative_times(costs, names) == {"palpate": "1/100", "quant": "2.2"}
-    assert development_chart.relative_times(costs[2:], names) == {}
-
-
 def test_cases_and_methods_exist_and_have_words_for_people():
     """No protocol, published set or described method is shown by its name in commands."""
     usual = set(development_experiment.usual_methods(development_experiment.STUDY))
@@ -218,10 +205,15 @@ def test_cases_and_methods_exist_and_have_words_for_people():
         assert series == one.sets[0].startswith("aeon:")
 
 
-def test_each_method_has_one_result_a_test():
-    """Of two the page would show the last, which may be of shorter sweeps."""
+def test_results_are_one_a_test_and_times_those_of_minirocket():
+    """Else the page would show the last; without MiniRocket times are not compared."""
     found = [(one["case"], one["method"]) for one in committed("development")["results"]]
     assert len(found) == len(set(found)) > 100
+    costs = [timed("minirocket", ms) for ms in (12.0, 10.0)]
+    costs += [timed("palpate", 0.1), timed("quant", 22.0)]
+    names = ["palpate", "quant", "ds-cnn"]
+    assert development_chart.relative_times(costs, names) == {"palpate": "1/100", "quant": "2.2"}
+    assert development_chart.relative_times(costs[2:], names) == {}
 
 
 def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[str, Any]]:

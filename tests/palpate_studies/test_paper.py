@@ -93,20 +93,16 @@ def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
     assert all(low <= mean <= high for lines in by.values() for mean, low, high in lines)
 
 
-def test_exploration_stops_when_it_is_sure():
-    """Sure sweeps need one. Uniform probabilities use all four, and are correct once in six."""
+def test_intervals_are_over_places_and_exploration_stops_when_sure():
+    """192 sweeps at eight positions; sure sweeps need one, uniform ones all four."""
+    place = np.repeat(np.arange(8), 24)
+    _, low, high = paper_experiment.estimate(place % 2 == 0, place)
+    assert high - low > 0.5
     sure = outcome("lopo", "H-svm", right=1)
     assert [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])] == [(1, 1)] * 3
     sure.logits[:] = 0
     unsure = [(e["sweeps"], e["share"][0]) for e in paper_experiment.explored([sure])]
     assert unsure == [(4, round(1 / 6, 4))] * 3
-
-
-def test_intervals_are_over_places():
-    """Eight positions, each correct or wrong as a whole, are not 192 independent sweeps."""
-    place = np.repeat(np.arange(8), 24)
-    _, low, high = paper_experiment.estimate(place % 2 == 0, place)
-    assert high - low > 0.5
 
 
 def test_summary_pools_seeds_and_keeps_each_result(results: dict[str, Any]):

@@ -68,11 +68,15 @@ def test_each_set_is_fitted_once(monkeypatch: pytest.MonkeyPatch):
     assert list(run.left_out) == ["fabrics"]
 
 
-def test_views_are_read_from_the_trunk():
-    """Each part of an architecture is a view; a trunk of the spectrum has one."""
+def test_views_are_read_from_the_trunk_and_needed():
+    """Each part of an architecture is one; the table needs the cost of each."""
     assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
     every = Architecture((4,), 8, 2, 0, True, POOLS, True, True, 3)
     assert recipe_views.views_of(every) == list(recipe_page.VIEWS)
+    with pytest.raises(KeyError, match="stages"):
+        recipe_page.table(
+            {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
+        )
 
 
 def test_the_table_has_a_row_for_each_view_with_its_sets():
@@ -84,14 +88,6 @@ def test_the_table_has_a_row_for_each_view_with_its_sets():
     assert rows[3].endswith("| all 2 |")
     assert rows[-1].endswith("| 7 fabrics |")
     assert rows[0].endswith("| no set |")
-
-
-def test_results_without_a_view_are_refused():
-    """The table needs the cost of each view."""
-    with pytest.raises(KeyError, match="stages"):
-        recipe_page.table(
-            {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
-        )
 
 
 class LoadsFits:

@@ -73,7 +73,7 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
 
 
 def test_stale_results_are_made_in_order_and_none_twice(project: Path):
-    """Only commands of folds get the options of the machine that runs them."""
+    """A named one whatever it is; commands of folds get the options of the machine."""
     run, lines = RunCommands(), []
     reports.make((), ("--scheduler", "tcp://here"), lines.append, run)
     older = ["palpate_train", "older", "--scheduler", "tcp://here"]
@@ -83,10 +83,6 @@ def test_stale_results_are_made_in_order_and_none_twice(project: Path):
     again = RunCommands()
     reports.make((), (), lines.append, again)
     assert again.words == [["palpate", "new"]]
-
-
-def test_a_named_result_is_made_again_whatever_it_is(project: Path):
-    """In the order of the list, not of the names."""
     run = RunCommands()
     reports.make(("current", "older"), (), lambda line: None, run)
     assert [words[1] for words in run.words] == ["older", "current"]

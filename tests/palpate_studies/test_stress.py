@@ -84,12 +84,17 @@ def test_one_task_travels_and_counts():
     assert done["curves"]["gain-up"]["right"][-1] == right < 12
 
 
-def test_an_answer_that_is_not_finite_is_wrong():
-    """Also if the label would have been right."""
+def test_what_is_not_finite_is_wrong_and_refusals_are_said():
+    """A set of another kind is the caller's error; a refused set is a result."""
     done = stress.evaluate_method(
         replace(FAKE, train=learn_broken), small(), EvaluationSweeps(small()), 0
     )
     assert done["curves"]["dead"]["right"][0] == 9
+    with pytest.raises(FormatError, match="uint8"):
+        stress.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), 0)
+    short = small(shape=(4, 10, 3, 3))
+    task = stress.evaluate_method(FAKE, short, EvaluationSweeps(short), 0)
+    assert "10 frames" in task["refused"]
 
 
 def test_features_are_of_the_corrupted_counts():
@@ -120,15 +125,6 @@ def test_a_pair_is_both_corruptions_at_once():
     moved = (changed != trial.sweeps.samples).any(axis=1)
     assert moved[~dead].all()
     assert (both["noise+dead"].apply(trial, 0, 0) == trial.sweeps.samples).all()
-
-
-def test_what_cannot_be_done_is_said():
-    """A set of another kind is the caller's error; a refused set is a result."""
-    with pytest.raises(FormatError, match="uint8"):
-        stress.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), 0)
-    short = small(shape=(4, 10, 3, 3))
-    task = stress.evaluate_method(FAKE, short, EvaluationSweeps(short), 0)
-    assert "10 frames" in task["refused"]
 
 
 def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

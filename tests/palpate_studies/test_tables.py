@@ -89,8 +89,8 @@ def test_what_is_missing_is_an_error_and_nothing_is_written(
     assert (project / tables.RECIPE).read_bytes() == page
 
 
-def test_answers_of_the_bundle_add_up():
-    """Each row of README's tables counts all its sweeps once."""
+def test_answers_add_up_and_older_figures_say_so_first():
+    """Each row counts all its sweeps once; the note stands before the caption."""
     for study, table in (("stress", tables.stressed), ("junk", tables.junk)):
         rows = [
             re.findall(r"[\d,]+(?= )", line) for line in table(committed(study)).split("\n")[3:-1]
@@ -99,6 +99,9 @@ def test_answers_of_the_bundle_add_up():
     (first, *_) = tables.stressed(committed("stress")).split("\n")[3:]
     right, wrong, none = map(int, re.findall(r"\| (\d+) (?=\|)", first))
     assert right + wrong + none == committed("stress")["box"]["curves"]["correct"]["noise"]["total"]
+    figures: dict[str, Any] = committed("bench") | {"bundle": score.shipped()}
+    assert bench_table.table(figures).startswith("Measured by")
+    assert "0badbead" in bench_table.table(figures | {"bundle": "0badbead"}).partition("\n")[0]
 
 
 @pytest.mark.parametrize(
@@ -117,13 +120,6 @@ def test_answers_of_the_bundle_add_up():
 def test_the_bench_has_a_row_for_each_figure(row: str):
     """Figures are in percent or have units."""
     assert re.search(row, bench_table.table(committed("bench")))
-
-
-def test_figures_of_an_older_bundle_say_so_first():
-    """The note stands before the caption."""
-    figures: dict[str, Any] = committed("bench") | {"bundle": score.shipped()}
-    assert bench_table.table(figures).startswith("Measured by")
-    assert "0badbead" in bench_table.table(figures | {"bundle": "0badbead"}).partition("\n")[0]
 
 
 def result(method: str, protocol: str, right: int, removed: bool = True, **more: Any) -> Any:

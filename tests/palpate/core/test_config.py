@@ -70,8 +70,9 @@ def test_a_board_is_named_by_file_or_option_or_not_at_all(folder, tmp_path):
     (folder / "palpate.toml").write_text('board = "a"\n')
     assert (_load(folder).trigger.start, _load(folder).sources["board"]) == ("L1", "palpate.toml")
     assert (_load(folder, "b").trigger.start, _load(folder, "b").output.ready) == ("", "L9")
-    (tmp_path / "palpate.toml").write_text("")
-    c = _load(tmp_path)
+    (bare := tmp_path / "bare").mkdir()
+    (bare / "palpate.toml").write_text("")
+    c = _load(bare)
     assert set(c.sources.values()) == {"code"}
     assert c.trigger == config.TriggerConfig()
     assert (c.output.ready, c.output.class_bits, c.trigger.start, c.serial.port) == ("", (), "", "")

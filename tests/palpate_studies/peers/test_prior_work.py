@@ -111,8 +111,8 @@ def test_correlations_are_those_of_scipy(frames: int):
     )
 
 
-def test_a_still_taxel_takes_no_part_in_correlations():
-    """A dead taxel changes none of the four numbers; one varying taxel has no correlation."""
+def test_still_taxels_and_rounded_means_are_none():
+    """A dead taxel changes no correlation; without means weights are equal."""
     x = noise()
     for level in (0, 3.3e30):
         dead = np.concatenate([x, np.full((len(x), 2, 1), level, np.float32)], axis=2)
@@ -120,6 +120,12 @@ def test_a_still_taxel_takes_no_part_in_correlations():
             correlation(dead, RATE)[3:7], correlation(x, RATE)[3:7], atol=1e-12
         )
     assert correlation(x[:, :1, :1], RATE)[3:7].tolist() == [0, 0, 0, 0]
+    x = noise()
+    centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
+    assert centred.mean(axis=0, dtype=np.float64).any()
+    np.testing.assert_array_equal(features.taxel_weights(centred), np.full(6, 1 / 6))
+    assert not static(centred, RATE)[:6].any()
+    assert correlation(centred, RATE)[8] == 0
 
 
 @pytest.mark.parametrize("level", [0, 255])
@@ -131,16 +137,6 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
     np.testing.assert_allclose(correlation(x, RATE), [low, RATE, 1, 0, 0, 0, 0, low, level])
     whole = [level, 0, level, level, 0, 0, float(level > 0)]
     np.testing.assert_allclose(static(x, RATE), [level] * 4 + [0] * 4 + whole)
-
-
-def test_a_mean_that_rounding_left_is_none():
-    """Without means the weights are equal, and no feature shows the rounding error."""
-    x = noise()
-    centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
-    assert centred.mean(axis=0, dtype=np.float64).any()
-    np.testing.assert_array_equal(features.taxel_weights(centred), np.full(6, 1 / 6))
-    assert not static(centred, RATE)[:6].any()
-    assert correlation(centred, RATE)[8] == 0
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(1, 1), (3, 3), (16, 1), (20, 30)])
@@ -174,14 +170,10 @@ def test_what_cannot_be_computed_is_refused(of, shape: tuple[int, ...], rate_hz:
 
 
 def test_exploring_stops_when_the_posterior_is_sure():
-    """.6, then .69, then .77: two sweeps for .65, three for .7, all of them for .99."""
+    """Two sweeps for .65, three for .7; later ones outweigh a certain wrong first one."""
     log_p = np.log(np.array([[0.6, 0.4]] * 3))
     found = [prior_work.explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)]
     assert found == [(0, 1), (0, 2), (0, 3), (0, 3)]
-
-
-def test_later_sweeps_correct_the_first():
-    """Later sweeps outweigh a wrong first sweep, even if it is certain beyond float64."""
     log_p = np.log(np.array([[0.6, 0.4], [0.1, 0.9], [0.1, 0.9]]))
     assert prior_work.explore(log_p, 0.95) == (1, 3)
     assert prior_work.explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1

@@ -43,12 +43,17 @@ def test_the_embedding_is_lda(fixed: int):
     )
 
 
-def test_untrained_features_are_kept_completely():
-    """With `fixed` the distance is the full Mahalanobis distance in the last features."""
+def test_untrained_features_are_kept_and_come_back():
+    """With `fixed` the distance is the full Mahalanobis distance, and differences return."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
     unknown = np.array([[0.0, 0.0, 20.0]])
     assert embedding.embed(x, y, 0).novelty(unknown)[0] < 10
     assert embedding.embed(x, y, 1).novelty(unknown)[0] > 300
+    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)))
+    one = embedding.embed(x, y, 5)
+    z = one(x)
+    np.testing.assert_allclose((z[0] - z[1]) @ one.untrained, (x[0] - x[1])[-5:], atol=1e-2)
+    assert (embedding.embed(x, y, 18).untrained == np.eye(20)).all()
 
 
 def test_each_material_has_its_own_shape_in_untrained_features():
@@ -67,15 +72,6 @@ def test_each_material_has_its_own_shape_in_untrained_features():
         np.linalg.eigvalsh(few.shapes.astype(float) @ few.shapes.astype(float).swapaxes(1, 2)) < 2
     ).all()
     assert embedding.embed(x, y).shapes.shape == (2, 0, 0)
-
-
-def test_differences_of_untrained_features_come_back():
-    """From differences of z; of all directions, if none is selected."""
-    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)))
-    one = embedding.embed(x, y, 5)
-    z = one(x)
-    np.testing.assert_allclose((z[0] - z[1]) @ one.untrained, (x[0] - x[1])[-5:], atol=1e-2)
-    assert (embedding.embed(x, y, 18).untrained == np.eye(20)).all()
 
 
 def test_the_distance_is_the_sum_of_two_views():

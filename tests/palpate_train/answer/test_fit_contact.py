@@ -50,16 +50,12 @@ def test_the_places_of_a_training_set():
         )
 
 
-def test_the_limit_leaves_each_position_out():
-    """The largest distance of a sweep from the other positions; of one an eighth of the pitch."""
+def test_each_position_is_left_out_and_many_are_thinned():
+    """The farthest sweep from the others, or an eighth of the pitch; at most a thousand."""
     found = positions_of(trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), LOADS, pitch_mm=4.0)
     assert found.limit_mm == pytest.approx(found.cols_mm[2] - found.cols_mm[1], abs=0.01)
     for positions in ([(1.5, 1.5)], [(1.5, 1.5)] * 3):
         assert positions_of(trained(*positions), LOADS, pitch_mm=4.0).limit_mm == 0.5
-
-
-def test_many_positions_are_thinned():
-    """A bundle has at most a thousand positions, evenly spaced among more."""
     found = positions_of(
         trained(*[(1.5, 1 + i / 1100) for i in range(1100)], each=1), LOADS, pitch_mm=4.0
     )

@@ -37,8 +37,8 @@ def made(n: int = 20, wrong: float = 0.0):
     )
 
 
-def test_what_the_copies_vary_in_makes_nothing_unknown():
-    """Far in the direction of the copies is beyond the limit in place alone."""
+def test_distances_leave_out_what_the_copies_vary_in():
+    """Far in their direction is beyond the limit in place alone; means.npz gives the same."""
     z, fit, _ = made()
     assert fit
     x = sweeps(50, 5, spread=10)[0]
@@ -47,12 +47,6 @@ def test_what_the_copies_vary_in_makes_nothing_unknown():
     assert np.mean(z.novelty(x) <= embedding.limit(z.novelty(sweeps(50, 6)[0]))) < 0.6
     x[:, 1] += 30
     assert (fit.embedding.novelty(z(x)) > fit.rule.limit).all()
-
-
-def test_the_box_measures_the_same_distances():
-    """turn, means and shapes of means.npz give the distances of their embedding."""
-    z, fit, _ = made()
-    assert fit
     classes = fit.classes(z.classes())
     assert isinstance(classes, Classes)
     assert classes.displaced
@@ -64,7 +58,7 @@ def test_the_box_measures_the_same_distances():
 
 
 def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
-    """Ten in a hundred copies wrong at .62 ask for more; none asks for no more."""
+    """Ten in a hundred at .62 ask for more; none for none; half, surely wrong, for too much."""
     _, fit, _ = made()
     assert fit
     assert (fit.rule.unsure, fit.rule.temperature) == (fit_displacement.UNSURE[0], 1)
@@ -73,10 +67,6 @@ def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
     assert 0.5 < fit.rule.unsure < 0.95
     p = np.exp(1.2 / fit.rule.temperature) / (2 + np.exp(1.2 / fit.rule.temperature))
     assert fit.rule.unsure > p
-
-
-def test_copies_that_are_surely_wrong_leave_no_sure_answer():
-    """If half of the copies are certain and wrong, no probability is enough."""
     x, labels, groups = sweeps(10, 0)
     copied = AugmentedCopies(x, labels, np.arange(len(x)), groups >= 6)
     truth = labels[groups >= 6]

@@ -54,15 +54,11 @@ def test_the_means_move_as_the_copies_do(rng: Generator):
     assert figures["left out"][1] < 0.05
 
 
-def test_each_embedding_has_its_own_changes(rng: Generator):
-    """The second one has the directions of the first in reverse."""
+def test_changes_are_those_of_the_embedding_and_end_with_accuracy(rng: Generator):
+    """In reverse for the second; from two thirds of the severities on another mean is near."""
     given = sweeps(rng)
     found = fit(judge(sweeps(rng)), given, given.seen_by(lambda z: z[:, ::-1]))
     assert (found.changes[1] == found.changes[0][:, :, ::-1]).all()
-
-
-def test_a_severity_that_costs_accuracy_is_not_allowed_for(rng: Generator):
-    """From two thirds of the severities on the nearest mean is another."""
     found = fit(judge(sweeps(rng, worst=9.0)), sweeps(rng, worst=9.0))
     assert found.allowances[0].end == pytest.approx(1.05 * MOST * 4 / 6)
 

@@ -27,8 +27,8 @@ def test_known_sweeps_are_within_the_limits_and_others_are_not():
     assert not distances.known(np.array([[0, 0, 6], [0, 0, 6]])).any()
 
 
-def test_limits_of_training_sweeps_are_told():
-    """A displaced contact is named as far as in the training copies; both limits are printed."""
+def test_limits_of_training_sweeps_are_told_where_there_is_a_rule():
+    """As far as in the copies, both limits; without the rules nothing is said or changed."""
     packaged = bundle.load(bundle.DEFAULT).manifest
     assert packaged.displacement
     assert packaged.contact
@@ -40,10 +40,6 @@ def test_limits_of_training_sweeps_are_told():
     assert copies_mm == pytest.approx(1.9, abs=0.4)  # of a pitch of 4 mm
     assert "up to" in fit_displacement.text(manifest)
     assert "9 steps" in fit_early.text(packaged)
-
-
-def test_without_a_rule_nothing_is_said_and_nothing_is_changed():
-    """Of a bundle that does not know displaced contacts or early answers."""
     manifest = bundle.load(bundle.DEFAULT).manifest
     bare = replace(manifest, early=None, displacement=None)
     assert fit_early.text(bare) == fit_displacement.text(bare) == ""

@@ -21,16 +21,12 @@ def swept(speeds: list[float]) -> Dataset:
     return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")
 
 
-def test_the_range_covers_the_sweeps():
-    """From the slowest to the fastest, within the error of the measurement."""
+def test_the_range_covers_nearly_all_sweeps():
+    """Within the error of the measurement; two wrong ones of a hundred do not widen it."""
     found, why = trained_speeds(swept([1.0, 2.0] * 4 + [1.5]), skin.PITCH_MM)
     assert found
     assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 60.0), rel=0.03)
     assert why == ""
-
-
-def test_two_of_a_hundred_do_not_widen_it():
-    """Speeds that are wrong in two of a hundred sweeps, one at each end."""
     found, _ = trained_speeds(swept([1.0] * 98 + [0.6, 3.0]), skin.PITCH_MM)
     assert found
     assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 30.0), rel=0.05)

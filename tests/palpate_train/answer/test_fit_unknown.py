@@ -76,15 +76,11 @@ def test_a_material_without_copies_has_the_scatter_of_the_others(rng: Generator)
     assert found.by_kind["hum"][2][2, 2] > 10
 
 
-def test_too_few_sweeps_give_no_rule(rng: Generator):
-    """Seven sweeps of each material, or no copies."""
+def test_few_sweeps_give_no_rule_and_no_change_no_weight(rng: Generator):
+    """Seven sweeps of each or no copies; copies that change nothing are kept anyway."""
     scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
     assert choose(scatters, sweeps(rng, 7, hum=HUM)) is None
     assert choose(scatters, replace(sweeps(rng), copies={})) is None
-
-
-def test_alterations_that_change_nothing_get_no_weight(rng: Generator):
-    """Their copies are kept anyway."""
     still = np.zeros(4)
     rule = choose(Scatters.of(sweeps(rng, still=still), SPACE), sweeps(rng, still=still))
     assert rule
@@ -92,7 +88,7 @@ def test_alterations_that_change_nothing_get_no_weight(rng: Generator):
 
 
 def test_what_shows_an_unknown_material_counts_more(rng: Generator):
-    """In the trained directions alone, and in features that were not trained."""
+    """Trained directions and untrained features; each where none is known as untrained."""
     far = np.array([[0.0, 0, 0, 0], [12, 0, 9, 0], [0, 12, 0, 9]])
 
     def weight(means: NDArray[np.float64]) -> float:
@@ -101,10 +97,6 @@ def test_what_shows_an_unknown_material_counts_more(rng: Generator):
         return Scatters.of(moved, replace(SPACE, means=means)).weight_of_trained(moved)
 
     assert weight(MEANS) > weight(far)
-
-
-def test_all_directions_count_where_no_feature_is_known_as_untrained(rng: Generator):
-    """An unknown material is refused in each of them."""
     space = replace(SPACE, untrained=np.eye(4))
     scatters = Scatters.of(sweeps(rng, hum=HUM), space)
     rule = choose(scatters, sweeps(rng, hum=HUM))

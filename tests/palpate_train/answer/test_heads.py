@@ -88,15 +88,11 @@ def test_a_feature_that_moves_with_a_condition_counts_less():
     )
 
 
-def test_recordings_are_no_condition():
-    """Each sweep is a recording of its own; only what a user may vary is one."""
+def test_recordings_are_no_condition_and_a_material_without_sweeps_is_never_named():
+    """Only what a user may vary is one; the missing logit lies below all others."""
     groups = {"recording": np.arange(4), "force": np.array([5, 7, 5, 9])}
     assert heads.condition_values(groups, 4).tolist() == [[0], [1], [0], [2]]
     assert heads.condition_values({"recording": np.arange(4)}, 4).shape == (4, 0)
-
-
-def test_a_material_without_sweeps_is_never_named():
-    """Its logit lies below all others."""
     x, labels = drawn(40, 5)
     weight, bias = heads.fit_discriminant(x, np.where(labels == 2, 4, labels), 5)
     assert set((x @ weight.T + bias).argmax(axis=1)) <= {0, 1, 3, 4}
@@ -114,8 +110,8 @@ def test_logits_of_many_features_stay_above_a_missing_material():
     assert set(logits.argmax(axis=1)) <= {0, 1, 2, 3}
 
 
-def test_constant_and_equal_features_change_nothing_but_themselves():
-    """With a silent feature and a copy of another, weights are finite and answers the same."""
+def test_features_without_scatter_leave_finite_heads():
+    """A silent feature and a copy change nothing; without any scatter the nearest mean wins."""
     x, labels = drawn(60, 6)
     weight, bias = heads.fit_discriminant(np.hstack([x, x[:, :1], np.ones((60, 1))]), labels, 4)
     assert np.isfinite(weight).all()
@@ -123,10 +119,6 @@ def test_constant_and_equal_features_change_nothing_but_themselves():
     plain = x @ plain_weight.T + plain_bias
     more = np.hstack([x, x[:, :1], np.ones((60, 1))]) @ weight.T + bias
     assert np.mean(plain.argmax(axis=1) == more.argmax(axis=1)) > 0.95
-
-
-def test_features_without_any_scatter_are_compared_by_their_means():
-    """If all sweeps of a material are equal, the nearest mean is named."""
     labels = np.repeat([0, 1], 3)
     x = np.repeat([[0.0, 1.0], [2.0, 1.0]], 3, axis=0)
     weight, bias = heads.fit_discriminant(x, labels, 2)

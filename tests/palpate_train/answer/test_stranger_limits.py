@@ -67,14 +67,10 @@ def test_a_cross_fit_is_corrected_for_what_it_lacks(parts: int):
     np.testing.assert_allclose(known[0] - known[1], 1.5 - 1.5 / (parts - 1), atol=1e-9)
 
 
-def test_half_of_the_known_sweeps_are_kept_at_any_cost():
-    """A stranger nearer than known sweeps, at a million times the cost, does not close the box."""
+def test_known_sweeps_are_kept_at_any_cost():
+    """Half at a million times the cost; nearly all where no material was left out."""
     figures = limits({"force": left_out(200, apart=-3.0)}, 1e6).figures
     assert figures["strict"]["answered"][0] >= 0.45
-
-
-def test_without_strangers_nearly_all_known_sweeps_are_within():
-    """Where no other material was left out, the three limits are one."""
     sweeps = left_out()
     none = np.full_like(sweeps.known, np.nan)
     found = limits({"force": replace(sweeps, strangers=none, finished=none)})
@@ -113,15 +109,11 @@ def test_no_known_sweep_is_refused(sweeps: dict[str, float]):
         limits(given)
 
 
-def test_distances_of_zero_and_one_sweep_give_a_limit():
-    """Sweeps at their mean, and a single one, are finite."""
+def test_distances_of_zero_and_the_nearest_other_mean():
+    """One sweep or sweeps at their mean are finite; the own mean is no other."""
     one = np.zeros(1)
     found = limits({"force": LeftOut(one, one, one, one, one.astype(int), one.astype(int), 2)})
     assert 0 < found.strict <= found.loose < np.inf
-
-
-def test_the_nearest_other_mean():
-    """A sweep's own mean does not count, and with one material there is no other."""
     means = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])
     found = nearest_other(means + 0.0, np.arange(3), means, lambda k: np.stack([np.eye(2)] * 2))
     assert found.tolist() == [9.0, 9.0, 25.0]

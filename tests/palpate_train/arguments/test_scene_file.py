@@ -54,11 +54,16 @@ def test_every_option_can_stand_in_the_file(tmp_path: Path):
     assert (found.reduce, found.reattached, found.size) == (["window", "rate"], True, "64")
 
 
-def test_the_command_line_counts_more_than_the_file(tmp_path: Path):
-    """A value of both is that of the command line; false is as if the flag were not there."""
+def test_the_command_line_and_variables_change_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its value counts, and false is as if the flag were not there; variables are replaced."""
     found = parsed(tmp_path, WHOLE, "--budget-ms", "2")
     assert (found.budget_ms, found.budget_kb) == (2, 96.5)
     assert not parsed(tmp_path, "reattached = false").reattached
+    monkeypatch.setenv("SWEEPS_AT", "/sweeps")
+    found = parsed(tmp_path, 'set = ["$SWEEPS_AT/a.npz"]')
+    assert found.sets == ["/sweeps/a.npz"]
 
 
 @pytest.mark.parametrize(
@@ -89,13 +94,6 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
     path.write_bytes(b'size = "\xff"')
     with pytest.raises(FormatError, match="not TOML"):
         scene_file.words(path, command())
-
-
-def test_a_folder_may_be_named_by_a_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The variable is replaced by its value."""
-    monkeypatch.setenv("SWEEPS_AT", "/sweeps")
-    found = parsed(tmp_path, 'set = ["$SWEEPS_AT/a.npz"]')
-    assert found.sets == ["/sweeps/a.npz"]
 
 
 @pytest.mark.parametrize("name", ["tubes.toml", "fabrics.toml"])

@@ -33,11 +33,13 @@ def band(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return power[:, int(low * power.shape[1]) : int(high * power.shape[1])].mean(axis=1)
 
 
-def test_nothing_varies_at_zero_and_nothing_is_drawn():
-    """With all settings at 0 the sweeps and the generator are unchanged."""
+def test_nothing_varies_at_zero_and_little_without_vibrations():
+    """At 0 nothing is drawn; without kernels of sum zero no damping and less noise."""
     x, rng = sweeps(), np.random.default_rng(3)
     np.testing.assert_array_equal(augment(x, 4, OFF, rng), x)
     assert rng.bit_generator.state == np.random.default_rng(3).bit_generator.state
+    assert default_augmentation(zero_sum=True) == Augmentation()
+    assert default_augmentation(zero_sum=False) == SLOW != Augmentation()
 
 
 @pytest.mark.parametrize(
@@ -62,12 +64,6 @@ def test_every_parameter_changes_sweeps_each_otherwise_and_leaves_its_input(sett
     assert not np.array_equal(once, other)
     np.testing.assert_array_equal(x, before)
     assert len({sweep.tobytes() for sweep in once}) > 1
-
-
-def test_sensors_without_vibrations_get_an_augmentation_of_their_own():
-    """Without kernels that sum to zero nothing is damped, and there is less noise."""
-    assert default_augmentation(zero_sum=True) == Augmentation()
-    assert default_augmentation(zero_sum=False) == SLOW != Augmentation()
 
 
 @pytest.mark.slow
@@ -110,13 +106,17 @@ def test_gains_are_of_all_taxels_or_of_each():
         assert (log.std(axis=1).max() < 1e-3) == (taxels == 1)
 
 
-def test_silent_taxels_are_zero_and_the_others_as_they_were():
-    """About the wanted share of taxels is silent."""
+def test_a_share_of_the_taxels_is_silent_or_noisy():
+    """About the wanted one; up to four deviations of noise, the others as they were."""
     x = sweeps(200, frames=20)
     now = varied(x, silent=0.2)
     dead = (now == 0).all(axis=2)
     assert 0.17 < dead.mean() < 0.23
     np.testing.assert_array_equal(now[~dead], x[~dead])
+    level = varied(np.zeros((200, 16, 300), np.float32), noisy=0.1).std(axis=2)
+    assert 0.07 < (level > 0).mean() < 0.13
+    assert 3 < level.max() < 4.5
+    assert not (level > 0).all(axis=1).any()
 
 
 def test_a_stretch_changes_the_rate_by_no_more_than_asked():
@@ -163,20 +163,19 @@ def test_noise_is_white_and_of_another_level_in_every_sweep():
     assert stats.kurtosis(loud, axis=None) == pytest.approx(0, abs=0.15)
 
 
-def test_a_noisy_taxel_is_noisy_alone():
-    """About the wanted share of the taxels have noise, up to four deviations."""
-    level = varied(np.zeros((200, 16, 300), np.float32), noisy=0.1).std(axis=2)
-    assert 0.07 < (level > 0).mean() < 0.13
-    assert 3 < level.max() < 4.5
-    assert not (level > 0).all(axis=1).any()
-
-
-def test_drift_is_a_line_around_zero():
-    """Its ends have the wanted spread; the middle stays."""
+def test_drift_is_a_line_and_clipping_cuts_above():
+    """Ends have the wanted spread; values below the cut are unchanged."""
     line = varied(np.zeros((100, 16, 301), np.float32), drift=0.5)
     assert line[..., -1].std() == pytest.approx(0.5, rel=0.1)
     assert np.abs(np.diff(line, n=2)).max() < 1e-5
     assert np.abs(line[..., 150]).max() < 1e-5
+    x = sweeps(200, frames=100)
+    now = varied(x, clipped=0.3)
+    cut = (now != x).any(axis=2)
+    assert 0.24 < cut.mean() < 0.33  # a cut above the highest value shows nothing
+    top = now.max(axis=2, keepdims=True)
+    np.testing.assert_array_equal(now, np.minimum(x, top))
+    assert (top[cut] < x.max(axis=2, keepdims=True)[cut]).all()
 
 
 def test_hum_is_one_sine_on_all_taxels():
@@ -193,17 +192,6 @@ def test_hum_is_one_sine_on_all_taxels():
     assert all(
         s[max(p - 3, 0) : p + 4].sum() > 0.99 * s.sum() for s, p in zip(spectrum, peak, strict=True)
     )
-
-
-def test_what_is_clipped_is_cut_off_above():
-    """About the wanted share of the taxels is clipped; values below the cut are unchanged."""
-    x = sweeps(200, frames=100)
-    now = varied(x, clipped=0.3)
-    cut = (now != x).any(axis=2)
-    assert 0.24 < cut.mean() < 0.33  # a cut above the highest value shows nothing
-    top = now.max(axis=2, keepdims=True)
-    np.testing.assert_array_equal(now, np.minimum(x, top))
-    assert (top[cut] < x.max(axis=2, keepdims=True)[cut]).all()
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_no_severity_beyond_the_scale(severity: float):
 
 
 def test_corruptions_by_name():
-    """Unknown names are refused; simulated sweeps are drawn again, files changed."""
+    """Unknown names are refused, files changed; simulated sweeps drawn again, as by force."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="cold"):
         corruptions.find(["cold"])
@@ -97,6 +97,9 @@ def test_corruptions_by_name():
     assert {s.name for s in corruptions.applicable(EvaluationSweeps(small()))} == set(
         BY_NAME
     ) - physical
+    levels = [BY_NAME[name].apply(scene(), 0.5, 0).mean() for name in ("force-down", "force-up")]
+    sound = scene().sweeps.samples.mean()
+    assert levels[0] < 0.7 * sound < 1.2 * sound < levels[1]
 
 
 def test_the_scene_is_what_the_simulator_draws():
@@ -133,13 +136,6 @@ def test_a_window_error_reaches_into_the_rest():
         assert (mine == early).all() or (mine == np.concatenate([was[10:]] + [was[-1:]] * 10)).all()
 
 
-def test_force_is_the_worlds():
-    """With half the force, the finger presses about half as much."""
-    levels = [BY_NAME[name].apply(scene(), 0.5, 0).mean() for name in ("force-down", "force-up")]
-    sound = scene().sweeps.samples.mean()
-    assert levels[0] < 0.7 * sound < 1.2 * sound < levels[1]
-
-
 def test_speed_is_the_fingers():
     """At half the speed the relief has half its frequencies; those of friction stay."""
     still = replace(skin.WORLD, off=frozenset({"vibration", "drift", "noise", "spot"}))
@@ -164,7 +160,7 @@ def test_speed_is_the_fingers():
 
 
 def test_dead_stuck_and_noisy_taxels():
-    """The severity is the number of bad taxels; those dead at 1 are dead at 3."""
+    """The severity is their number, each dead on every axis; those dead at 1 are dead at 3."""
     trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
@@ -176,10 +172,6 @@ def test_dead_stuck_and_noisy_taxels():
     assert ((dead == 0).all(axis=1).sum(axis=(1, 2)) == 3).all()
     stuck = BY_NAME["stuck"].apply(trial, 3, 5)
     assert ((np.ptp(stuck, axis=1) == 0).sum(axis=(1, 2)) == 3).all()
-
-
-def test_a_taxel_is_dead_on_all_its_axes():
-    """The severity is the number of dead taxels, each dead on every axis."""
     trial = EvaluationSweeps(small(shape=(12, 120, 3, 3, 3)))
     changed = (BY_NAME["dead"].apply(trial, 3, 5) != trial.sweeps.samples).any(axis=1)
     assert (changed.any(axis=3).sum(axis=(1, 2)) == 3).all()
@@ -208,19 +200,6 @@ def test_a_scene_with_shear_is_drawn_anew():
     np.testing.assert_array_equal(
         drawn, trial.scene.draw(world=skin.World(shear=True, force_n=0.5))
     )
-
-
-def test_lost_frames_lie_on_the_line():
-    """A fifth is lost, never more than two in a row, each interpolated."""
-    trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
-    got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
-    lost = (got != was).all(axis=(2, 3))
-    assert 0.15 < lost.mean() < 0.25
-    assert not (lost[:, 2:] & lost[:, 1:-1] & lost[:, :-2]).any()
-    for i in range(len(was)):
-        there = np.flatnonzero(~lost[i])
-        want = np.interp(np.arange(400), there, was[i, there, 0, 1])
-        assert np.allclose(got[i, :, 0, 1], want, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -255,8 +234,8 @@ def test_gains_drift_steps_and_clipping():
     assert apply("saturation", 0.3).max() == pytest.approx(0.7 * trial.load)
 
 
-def test_hum_and_noise_have_their_strength():
-    """50 Hz is alike on all taxels; white noise is a share of each taxel's own deviation."""
+def test_hum_noise_and_lost_frames():
+    """Alike on all taxels, or a share of each; a fifth lost, two in a row at most, on a line."""
     sweeps = small("float32", (4, 600, 2, 2), 300.0)
     sweeps.samples[:, :, 0, 0] *= 4
     trial = EvaluationSweeps(sweeps)
@@ -266,6 +245,15 @@ def test_hum_and_noise_have_their_strength():
     assert hum.max() == pytest.approx(2 * np.sqrt(sweeps.samples.var(axis=1).mean()), rel=0.02)
     noise = BY_NAME["noise"].apply(trial, 0.5, 0) - sweeps.samples
     assert np.allclose(noise.std(axis=(0, 1)), 0.5 * trial.deviation, rtol=0.1)
+    trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
+    got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
+    lost = (got != was).all(axis=(2, 3))
+    assert 0.15 < lost.mean() < 0.25
+    assert not (lost[:, 2:] & lost[:, 1:-1] & lost[:, :-2]).any()
+    for i in range(len(was)):
+        there = np.flatnonzero(~lost[i])
+        want = np.interp(np.arange(400), there, was[i, there, 0, 1])
+        assert np.allclose(got[i, :, 0, 1], want, atol=1e-4)
 
 
 def test_counts_are_digitized_again():

@@ -96,8 +96,8 @@ def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str,
     np.testing.assert_array_equal(swapped, x.T)
 
 
-def test_square_arrays_of_taxels_and_frames_are_asked_for():
-    """16 frames of 16 taxels: no axis shows its kind."""
+def test_a_square_array_is_asked_for_unless_times_show_the_axis():
+    """16 frames of 16 taxels; a vector of times has as many values as there are frames."""
     x = np.arange(256).reshape(16, 16)
     with pytest.raises(FormatError, match="16 taxels"):
         frames.frames(Table(x), plan(grid="4x4"))
@@ -105,10 +105,6 @@ def test_square_arrays_of_taxels_and_frames_are_asked_for():
     np.testing.assert_array_equal(frames.frames(Table(x), asked)[0], x.T.reshape(16, 4, 4))
     with pytest.raises(FormatError, match=r"holds \[2, 3, 4\], but"):
         frames.frames(Table(np.zeros((2, 3, 4))), plan(transpose=True))
-
-
-def test_times_show_the_axis_of_time():
-    """A vector of times has as many values as there are frames."""
     x = cube(30, 30, 40)
     beside = {"t": np.arange(40) / 100}
     asked = plan(rate_hz=None, time="t:s")
@@ -140,14 +136,10 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
     np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
 
 
-def test_a_name_that_is_the_number_of_another_column_is_refused():
-    """pandas calls the columns 0, 1, 2, 3: is 2 a name or a number?"""
+def test_only_used_columns_must_be_clear():
+    """Is 2 a name or a number? A fault elsewhere does not matter; in a taxel it is named."""
     with pytest.raises(FormatError, match="'2'"):
         frames.frames(text(("0", "1", "2", "3")), plan(grid="2x1", columns="2,3"))
-
-
-def test_only_the_columns_that_are_used_must_be_numbers():
-    """A fault in another column does not matter; in a taxel or in the time it is named."""
     table = text(("t", "a", "b"), faults={2: "line 3, column 3 is '', which is not a number"})
     assert frames.frames(table, plan(grid="1x1", columns="a"))[0].shape == (40, 1, 1)
     for asked in ({"columns": "b"}, {"columns": "a", "time": "b:s"}, {"time": "t:s"}):
@@ -179,13 +171,17 @@ def test_text_columns_are_no_taxels():
 
 
 def test_a_column_of_dates_gives_the_times():
-    """Dates with a clock time, as loggers write them."""
+    """With a clock time; days that could be months are refused where they change."""
     dates = [f"2026-01-31 12:00:{k / 10:06.3f}" for k in range(40)]
     table = text(("when", "a"), texts={0: dates})
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
     np.testing.assert_allclose(time_s, np.arange(40) / 10)
     dates[3] = "noon"
     with pytest.raises(FormatError, match="4: 'noon'"):
+        frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    texts = ["01/02/2026 12:00:00"] * 39 + ["02/02/2026 12:00:00"]
+    table = text(("when", "a"), texts={0: texts})
+    with pytest.raises(FormatError, match="from '01/02/2026' to"):
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
@@ -247,14 +243,6 @@ def test_dates_go_on_at_midnight(form: str):
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
     assert time_s is not None
     assert time_s.tolist() == [0, 1, 2]
-
-
-def test_days_that_could_be_months_are_refused():
-    """Only where they change, since the time between frames then depends on it."""
-    texts = ["01/02/2026 12:00:00"] * 39 + ["02/02/2026 12:00:00"]
-    table = text(("when", "a"), texts={0: texts})
-    with pytest.raises(FormatError, match="from '01/02/2026' to"):
-        frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
 def test_fields_cut_a_table_where_they_change():

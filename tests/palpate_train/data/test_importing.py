@@ -123,17 +123,13 @@ def test_a_pattern_without_a_field_matches(tmp_path: Path, changes: dict):
     assert found.keys() == {"other.zip.npz"}
 
 
-def test_windows_are_cut_as_asked(tmp_path: Path):
-    """The middle window, or windows at intervals from the start; all of one recording."""
+def test_windows_and_times_are_those_of_the_recording(tmp_path: Path):
+    """The middle or at intervals, all of one; ms at 300 Hz give the right rate."""
     both(tmp_path, text)
     s = taken(tmp_path, every=Length("150ms", "--every")).sweeps
     assert s.groups["recording"].tolist() == [0, 0, 0, 1, 1, 1]
     np.testing.assert_array_equal(s.samples[1].reshape(10, 4), COUNTS[15:25])
     assert taken(tmp_path, window=Length("0.25s", "--window")).sweeps.format.window == 25
-
-
-def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
-    """Times rounded to ms at 300 Hz: counts as recorded, and the right rate."""
     both(tmp_path, lambda path: write(path, COUNTS, 300.0, np.round(1000 * np.arange(40) / 300)))
     made = taken(tmp_path, time="time:ms", rate_hz=None)
     assert made.sweeps.rate_hz == pytest.approx(300, rel=0.005)
@@ -339,13 +335,19 @@ def test_shapes_that_differ_are_refused(tmp_path: Path):
         taken(tmp_path, pattern=NamePattern("{material}.csv"))
 
 
-def test_axes_are_the_last_of_a_frame(tmp_path: Path):
-    """Columns x, y, z of each taxel become frames [R, C, A]."""
+def test_axes_are_the_last_of_a_frame_and_a_grid_is_needed(tmp_path: Path):
+    """Columns x, y, z of each taxel; without a grid no other file is read."""
     counts = np.arange(20 * 12).reshape(20, 12) % 250
     both(tmp_path, lambda path: text(path, counts))
     s = taken(tmp_path, grid="2x2x3").sweeps
     np.testing.assert_array_equal(s.samples[0], counts[5:15].reshape(10, 2, 2, 3))
     assert taken(tmp_path, grid="3x4x1").sweeps.samples.shape == (2, 10, 3, 4)
+    text(tmp_path / "a_1.csv")
+    (tmp_path / "b_2.csv").write_text("not read")
+    left_out: list[LeftOutFile] = []
+    with pytest.raises(FormatError, match="4 columns"):
+        import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
+    assert left_out == []
 
 
 def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
@@ -361,16 +363,6 @@ def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
     for name in ("set.npz", "set.h5"):
         made.sweeps.save(tmp_path / name)
         assert sets.load(str(tmp_path / name)).displays == displays
-
-
-def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
-    """The other files are not read: they would need it, too."""
-    text(tmp_path / "a_1.csv")
-    (tmp_path / "b_2.csv").write_text("not read")
-    left_out: list[LeftOutFile] = []
-    with pytest.raises(FormatError, match="4 columns"):
-        import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
-    assert left_out == []
 
 
 def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
@@ -418,16 +410,12 @@ def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: st
     assert len(np.unique(made.group("recording"))) == 8
 
 
-def test_arrays_without_a_pattern_of_files(tmp_path: Path):
-    """The arrays alone say all; a label that cannot be sent gets another."""
+def test_arrays_alone_say_all_or_are_named(tmp_path: Path):
+    """A label that cannot be sent gets another; no array, no match, several ways."""
     np.savez(tmp_path / "all.npz", **{"Filz weiß 1": COUNTS, "wool 2": COUNTS + 1})
     made = taken(tmp_path, pattern=None, variable="{material} {trial:d}").sweeps
     assert made.materials == ("Filz weiss", "wool")
     assert made.displays == {"Filz weiss": "Filz weiß"}
-
-
-def test_arrays_that_cannot_be_recordings_are_named(tmp_path: Path):
-    """A file without arrays, one without a match, and a name that fits in several ways."""
     text(tmp_path / "a.csv")
     np.savez(tmp_path / "b.npz", felt=COUNTS, t=np.arange(40.0))
     np.savez(tmp_path / "c.npz", felt_a_b=COUNTS, felt_c=COUNTS, **{"wool_1": COUNTS[:3]})

@@ -16,7 +16,7 @@ class SteppedClock:
 
 
 def test_progress_shows_how_much_is_left():
-    """Tasks done, tasks in all, the estimate of the time left, and the task."""
+    """Of all tasks, with the time; one counts when the next begins."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(4, lines.append, clock)
@@ -27,10 +27,6 @@ def test_progress_shows_how_much_is_left():
     assert progress.done == 2
     assert isinstance(lines[1], ProgressLine)
     assert (lines[1].done, lines[1].total) == (2, 4)
-
-
-def test_a_task_that_begins_is_not_done():
-    """It counts when the next begins; an estimate needs a finished task."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(3, lines.append, clock)

@@ -107,12 +107,17 @@ def test_what_is_new_is_fetched(ground: Ground, capsys: pytest.CaptureFixture[st
 
 
 def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """An empty folder is not an error, and no local folder is made."""
+    """Empty, or not there as sudo confirms; no local folder is made."""
     shutil.rmtree(ground.box)
     ground.box.mkdir()
     ground.pull()
     assert capsys.readouterr().out.startswith("fetched 0, ")
     assert not ground.here.exists()
+    ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
+    with pytest.raises(ApplianceError, match="user@box"):
+        pull.pull(
+            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
+        )
 
 
 def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
@@ -369,15 +374,6 @@ def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.Ca
             RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
         )
     assert capsys.readouterr().err.startswith("user@box: sudo: a")
-
-
-def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
-    """The folder does not exist, as sudo confirms."""
-    ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
-    with pytest.raises(ApplianceError, match="user@box"):
-        pull.pull(
-            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
-        )
 
 
 def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):

@@ -140,8 +140,8 @@ def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Call
         sets.load(path)
 
 
-def test_what_is_no_hdf5_is_refused(tmp_path: Path):
-    """Files cut anywhere, text, an empty file, a missing file."""
+def test_what_is_no_hdf5_and_pickles_are_refused(tmp_path: Path):
+    """Cut anywhere, text, empty, missing; object arrays before they are loaded."""
     whole = Path(hdf5(tmp_path / "whole.h5")).read_bytes()
     parts = {"half.h5": whole[: len(whole) // 2], "head.h5": whole[:8], "cut": whole[:-1]}
     for name, data in (parts | {"text.h5": b"x", "empty.h5": b""}).items():
@@ -149,6 +149,13 @@ def test_what_is_no_hdf5_is_refused(tmp_path: Path):
     for name in (*parts, "text.h5", "empty.h5", "gone.h5"):
         with pytest.raises(FormatError, match=f"^{name}: not a.*HDF5"):
             sets.load(str(tmp_path / name))
+    record(tmp_path / "1.npy", "a")
+    np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
+    about = json.loads((tmp_path / "1.json").read_text())
+    about["crc32"] = zlib.crc32((tmp_path / "1.npy").read_bytes())
+    (tmp_path / "1.json").write_text(json.dumps(about))
+    with pytest.raises(FormatError, match="allow_pickle"):
+        readers.read(tmp_path, sets.Dataset)
 
 
 @pytest.mark.parametrize("signature", [b"SNOD", b"HEAP", b"TREE", b"GCOL", b"labels"])
@@ -363,17 +370,6 @@ def test_broken_recordings_are_named(tmp_path: Path):
     (tmp_path / "1.json").unlink()
     with pytest.raises(FormatError, match=r"1\.npy"):
         sets.load(str(tmp_path))
-
-
-def test_a_recording_is_never_unpickled(tmp_path: Path):
-    """Object arrays in an .npy are refused before they are loaded."""
-    record(tmp_path / "1.npy", "a")
-    np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
-    about = json.loads((tmp_path / "1.json").read_text())
-    about["crc32"] = zlib.crc32((tmp_path / "1.npy").read_bytes())
-    (tmp_path / "1.json").write_text(json.dumps(about))
-    with pytest.raises(FormatError, match="allow_pickle"):
-        readers.read(tmp_path, sets.Dataset)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".CSV", ".txt", ".tsv", ".dat", ".mat", ".npy"])

@@ -39,8 +39,11 @@ def test_a_protocol_tests_what_it_did_not_train_on(text: str):
         assert not set(GRID.groups["recording"][train]) & set(GRID.groups["recording"][test])
 
 
-def test_leave_is_scikit_learns_leave_one_group_out():
-    """The same folds in the same order."""
+def test_leave_and_split_are_as_they_say():
+    """scikit-learn's folds in their order; values before and after the arrow."""
+    ((train, test),) = Protocol("split:position=2->0").folds(GRID, 1)
+    assert set(GRID.groups["position"][train]) == {2}
+    assert set(GRID.groups["position"][test]) == {0}
     theirs = model_selection.LeaveOneGroupOut().split(
         GRID.samples, GRID.labels, GRID.groups["position"]
     )
@@ -49,13 +52,6 @@ def test_leave_is_scikit_learns_leave_one_group_out():
     ):
         assert train.tolist() == their_train.tolist()
         assert test.tolist() == their_test.tolist()
-
-
-def test_split_trains_on_a_and_tests_on_b():
-    """Values before the arrow on one side, after it on the other; the rest on neither."""
-    ((train, test),) = Protocol("split:position=2->0").folds(GRID, 1)
-    assert set(GRID.groups["position"][train]) == {2}
-    assert set(GRID.groups["position"][test]) == {0}
 
 
 @settings(max_examples=30)
@@ -72,18 +68,14 @@ def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed:
     assert sorted(tested) == list(range(len(sweeps)))
 
 
-def test_random_folds_follow_their_seed():
-    """The same seed gives the same folds, another seed gives others."""
+def test_random_folds_follow_their_seed_and_need_recordings():
+    """Equal seeds, equal folds; for one recording no number would help."""
     sweeps = a_set([0, 1] * 20)
     one, same, other = (
         [t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2)
     )
     assert one == same
     assert one != other
-
-
-def test_a_material_of_one_recording_needs_more():
-    """No number of folds would help, so the message does not suggest a number."""
     with pytest.raises(FormatError, match="'b'"):
         Protocol("random:2").folds(a_set([0, 0, 1]), 1)
 
@@ -116,15 +108,11 @@ def test_a_group_that_cuts_recordings_is_refused(text: str):
         Protocol(text).folds(sweeps, 1)
 
 
-def test_a_recording_of_several_materials_is_refused():
-    """If numbers start anew for each material, sweeps of different materials would be fused."""
+def test_what_cannot_be_trained_on_is_refused():
+    """Numbers that start anew would fuse materials; one material is not enough."""
     sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
     with pytest.raises(FormatError, match="recording 5"):
         Protocol("leave:day").folds(sweeps, 1)
-
-
-def test_nothing_left_to_train_on_is_refused():
-    """If a group is the material, leaving out one of two leaves only one."""
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
     with pytest.raises(FormatError, match="2 sweeps"):
         Protocol("leave:session").folds(sweeps, 1)

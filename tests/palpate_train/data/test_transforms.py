@@ -21,15 +21,11 @@ def counting(shape: tuple[int, ...] = (2, 12, 2, 3), kind: str = "int16") -> Dat
     )
 
 
-def test_nothing_left_out_is_the_set_itself():
-    """It is not even copied."""
+def test_the_window_is_the_middle_or_the_set_itself():
+    """The inner six of twelve frames; with nothing left out it is not even copied."""
     sweeps = counting()
     assert WHOLE.of(sweeps) is sweeps
     assert str(WHOLE) == "all"
-
-
-def test_the_window_is_the_middle():
-    """The inner six of twelve frames; rate and everything else stay."""
     part = Change(window=0.5).of(counting())
     assert part.samples[0, :, 0, 0].tolist() == [30, 40, 50, 60, 70, 80]
     assert str(part.format).startswith("2x3 int16 at 60 Hz")
@@ -69,11 +65,15 @@ def test_rows_and_columns_stay_a_grid():
     assert line[0, 0, :, 0].tolist() == [0, 2, 4]
 
 
-def test_the_unloaded_skin_is_known_of_all_taxels_or_none():
-    """A change of frames leaves it unchanged."""
+def test_changes_add_up_and_keep_or_lose_the_unloaded_skin():
+    """Each removes something else; frames leave the skin, taxels take it."""
     known = replace(counting(), unloaded=np.zeros((2, 2, *counting().format.shape)))
     assert Change(window=0.5, rate=2).of(known).unloaded is known.unloaded
     assert Change(taxels=(5, 3, 0, 2)).of(known).unloaded is None
+    both = Change(window=0.5).and_then(Change(rate=2)).and_then(Change(taxels=(1,)))
+    assert both == Change(0.5, 2, (1,))
+    assert both.of(counting()).samples[0].ravel().tolist() == [26, 46, 66]
+    assert str(both).split(", ") == ["window 0.5", "rate 2", "taxels 1"]
 
 
 def test_a_taxel_goes_with_all_its_axes():
@@ -93,14 +93,6 @@ def test_a_taxel_goes_with_all_its_axes():
     assert sorted(found) == list(range(9))
 
 
-def test_changes_add_up():
-    """Each removes something else."""
-    both = Change(window=0.5).and_then(Change(rate=2)).and_then(Change(taxels=(1,)))
-    assert both == Change(0.5, 2, (1,))
-    assert both.of(counting()).samples[0].ravel().tolist() == [26, 46, 66]
-    assert str(both).split(", ") == ["window 0.5", "rate 2", "taxels 1"]
-
-
 def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
     """White noise of strength 3; `factors_of`: for each material by taxel."""
     kinds = len(next(iter(factors_of.values())))
@@ -115,12 +107,8 @@ def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12
 
 
 def test_the_informative_taxels_come_first():
-    """Two taxels that each separate half of the materials, anywhere on the skin."""
+    """Wherever they are; one of two that tell the same stays before any weaker one."""
     assert set(transforms.rank_taxels(textured({7: [1, 3, 1, 3], 2: [1, 1, 3, 3]}))[:2]) == {2, 7}
-
-
-def test_one_of_two_that_tell_the_same_stays():
-    """Each is dispensable beside the other; one must stay before any weaker taxel."""
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]

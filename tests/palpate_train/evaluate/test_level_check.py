@@ -61,12 +61,18 @@ def test_a_level_that_the_session_sets_is_reported(dtype: str, windows: int):
     check_sessions(level_check.warnings_of(sweeps))
 
 
-def test_a_taxel_may_have_three_axes():
-    """An axis counts as a taxel: a level of the second axis alone is reported."""
+def test_axes_are_taxels_and_many_values_are_drawn():
+    """A level of the second axis is reported; MOST_VALUES of a group, first to last."""
     sweeps = leveled(True)
     still = np.zeros_like(sweeps.samples)
     samples = np.stack([still, sweeps.samples, still], axis=-1)
     check_sessions(level_check.warnings_of(replace(sweeps, samples=samples)))
+    sweeps = leveled(True, each=3, sessions=30)
+    answers, possible = level_check._within(sweeps, sweeps.groups["session"])
+    tested = np.unique(sweeps.groups["session"][answers != level_check.UNTESTED])
+    assert len(tested) == level_check.MOST_VALUES
+    assert (tested[0], tested[-1]) == (0, 29)
+    assert possible.any(axis=1).sum() == 12 * level_check.MOST_VALUES
 
 
 def test_a_level_that_names_the_material_everywhere_is_counted():
@@ -156,18 +162,14 @@ def test_small_and_odd_sets_have_no_line(odd, sessions: int):
         assert level_check.warnings_of(odd(leveled(True, sessions=sessions))) == []
 
 
-def test_equal_sweeps_are_compared():
-    """Equal sweeps on many taxels give finite weights, and the line is as usual."""
+def test_odd_counts_are_scaled():
+    """Equal sweeps on many taxels, 1e30 and a constant taxel: finite, the usual line."""
     sweeps = leveled(True)
     equal = replace(sweeps, samples=np.tile((sweeps.samples + 50) // 100 * 100, (1, 1, 8, 8)))
     assert len(np.unique(equal.samples)) == len(MATERIALS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_sessions(level_check.warnings_of(equal))
-
-
-def test_counts_of_any_size_are_scaled():
-    """Counts of 1e30 and a constant taxel beside others do not change the line."""
     sweeps = leveled(True, dtype="float32")
     sweeps.samples[...] *= np.float32(1e30)
     sweeps.samples[..., 0, 0] = 3
@@ -187,16 +189,6 @@ def test_large_sets_are_drawn_evenly():
     assert np.bincount(levels.labels).tolist() == [level_check.MOST_SWEEPS // 4] * 4
     assert levels.samples.shape[2] == level_check.MOST_TAXELS
     check_sessions(level_check.warnings_of(turns))
-
-
-def test_many_values_are_drawn():
-    """At most MOST_VALUES values of a group, from its first to its last."""
-    sweeps = leveled(True, each=3, sessions=30)
-    answers, possible = level_check._within(sweeps, sweeps.groups["session"])
-    tested = np.unique(sweeps.groups["session"][answers != level_check.UNTESTED])
-    assert len(tested) == level_check.MOST_VALUES
-    assert (tested[0], tested[-1]) == (0, 29)
-    assert possible.any(axis=1).sum() == 12 * level_check.MOST_VALUES
 
 
 @pytest.mark.slow

@@ -320,15 +320,11 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
     judged(ranged(tight, tight.ranges.responses))
 
 
-def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """The first stage reaches 0.3 % of its range: no head can compensate."""
+def test_a_saturated_layer_and_an_old_head_are_refused(tight: Fit):
+    """No head makes up for .3 % of a range; behind int8 only a head of its own copes."""
     first, *others = tight.ranges.responses
     with pytest.raises(ExportRefused, match="limit"):
         judged(ranged(tight, (0.003 * first, *others)))
-
-
-def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
-    """Behind a saturated int8 trunk only a head of its own copes."""
     *before, last = tight.ranges.responses
     refitted = ranged(tight, (*before, 0.1 * last))
     judged(refitted)

@@ -111,14 +111,10 @@ def test_rules_against_faults_stay_although_held_out_sweeps_are_clean(
     assert fewer < right
 
 
-def test_few_held_out_sweeps_leave_all_rules_in():
-    """They would decide by chance."""
+def test_few_sweeps_leave_all_rules_in_and_none_can_be_both():
+    """They would decide by chance; the message has the rule's name."""
     few = sets.load(SWEEPS).take(np.arange(trial.EACH - 1))
     assert trial.decided(packaged(), few, 0, Asked(left_out=("hum",)))[0] == ["hum"]
-
-
-def test_a_rule_cannot_be_both():
-    """The message has its name."""
     with pytest.raises(FormatError, match="hum"):
         Asked(("hum",), ("taxels", "hum"))
 

@@ -7,13 +7,9 @@ from palpate.answer.objects import softmax
 from palpate_train.metrics.score import Score, fuse, interval
 
 
-def test_a_score_counts():
-    """The number of right answers and the total, as plain numbers."""
+def test_a_score_counts_with_the_papers_interval():
+    """Plain numbers; 55 of 60 is [.819, .964], the paper's T-HARD."""
     assert Score.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
-
-
-def test_one_pool_has_the_papers_wilson_interval():
-    """55 of 60 is [.819, .964], the paper's T-HARD."""
     assert interval(np.arange(60) < 55) == pytest.approx((0.819, 0.964), abs=5e-4)
 
 
@@ -40,16 +36,12 @@ def test_the_bootstrap_covers_the_truth():
 
 
 def test_windows_of_a_recording_are_fused_as_a_product():
-    """Log probabilities added, in the order of numbers, with the first sweep of each."""
+    """In the order of numbers; a probability of 0 in float does not outweigh the others."""
     logits = np.array([[1.0, 0.0], [0.0, 3.0], [2.0, 0.0]], np.float32)
     scores, first = fuse(logits, np.array([7, 3, 7]))
     assert first.tolist() == [1, 0]
     assert scores[1] == pytest.approx(np.log(softmax(logits[0])) + np.log(softmax(logits[2])))
     assert scores.argmax(1).tolist() == [1, 0]
-
-
-def test_no_window_can_veto_all_others():
-    """A probability of 0 in float does not outweigh the others with log 0."""
     scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1

@@ -23,13 +23,17 @@ def test_a_head_that_is_too_sure_is_cooled(times: float):
     assert 0.8 * times < found < 1.05 * times
 
 
-def test_a_calibrated_head_stays_as_it_is():
-    """Without evidence the temperature is 1, also if all are right by far."""
+def test_evidence_is_needed_to_cool_a_head():
+    """Without any the temperature is 1; a single group has the spread of its sweeps."""
     temperatures = [sufficient_temperature(*drawn(300, 10, seed)) for seed in range(20)]
     assert np.mean(np.array(temperatures) == 1) > 0.8
     assert max(temperatures) < 1.3
     labels = np.arange(60) % 3
     assert sufficient_temperature(100 * np.eye(3)[labels], labels, np.arange(60) % 6) == 1
+    logits, labels, groups = drawn(1000, 1)
+    assert sufficient_temperature(4 * logits, labels, groups) == sufficient_temperature(
+        4 * logits, labels, np.arange(1000)
+    )
 
 
 def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
@@ -51,11 +55,3 @@ def test_sweeps_that_fail_together_count_as_one():
     apart_temperature = sufficient_temperature(logits, labels, apart)
     assert sufficient_temperature(logits, labels, together) < apart_temperature
     assert apart_temperature > 1.2
-
-
-def test_with_one_group_each_sweep_is_its_own():
-    """A single group has no spread between groups, so the spread of its sweeps is used."""
-    logits, labels, groups = drawn(1000, 1)
-    assert sufficient_temperature(4 * logits, labels, groups) == sufficient_temperature(
-        4 * logits, labels, np.arange(1000)
-    )

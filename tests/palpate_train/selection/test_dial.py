@@ -79,21 +79,13 @@ def missing(numbers: slice) -> np.ndarray:
     return right
 
 
-def test_a_gain_within_the_error_is_no_reason():
-    """A gain at one place does not justify a larger size; the same gain at all places does."""
+def test_the_smallest_that_suffices_is_taken():
+    """A gain at one place is no reason; cost is the order; without .85 one standard error."""
     for small, chosen in ((missing(slice(12)), "bands"), (missing(slice(0, None, 8)), "all")):
         judged = judgement(bands=small, all=EVERYTHING)
         assert judged.choose(["bands", "all"], 0.0, EVERYTHING) == chosen
-
-
-def test_the_first_in_order_is_taken_where_all_suffice():
-    """The order is that of cost, whatever the names."""
     judged = judgement(bands=EVERYTHING, all=EVERYTHING)
     assert judged.choose(["all", "bands"], 0.0, EVERYTHING) == "all"
-
-
-def test_the_smallest_that_reaches_what_is_wanted_is_taken():
-    """87.5 % is enough for .85; where nothing reaches it, one standard error decides."""
     judged = judgement(bands=missing(slice(0, None, 8)), all=missing(slice(1)))
     assert judged.choose(["bands", "all"], 0.85, EVERYTHING) == "bands"
     assert judged.choose(["bands", "all"], 0.9, EVERYTHING) == "all"

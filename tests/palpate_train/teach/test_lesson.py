@@ -34,16 +34,12 @@ def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
     assert dict(lesson.left_out) == {"no material": 1, "gap": 1, "damaged": 1, "another format": 1}
 
 
-def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):
-    """Sweeps with and without a position can be taught together."""
+def test_a_missing_position_counts_and_no_sweep_is_an_error(tmp_path: Path):
+    """Taught with others; the message counts the omitted sweeps."""
     sweeps(tmp_path, "a", "b", position="1")
     sweeps(tmp_path, "a", "b", first=3)
     lesson = Lesson.read(tmp_path)
     assert len(set(lesson.sweeps.groups["position"].tolist())) == 2
-
-
-def test_nothing_to_teach_is_an_error_with_the_reasons(tmp_path: Path):
-    """The message counts the omitted sweeps."""
     sweeps(tmp_path, "", "")
     with pytest.raises(FormatError, match=r"2 no material"):
         Lesson.read(tmp_path)

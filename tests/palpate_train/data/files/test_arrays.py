@@ -17,19 +17,6 @@ FIELDS = np.zeros(40, [("t", "f8"), ("who", "S5"), ("taxels", "u2", (4,)), ("not
 FIELDS["t"], FIELDS["taxels"], FIELDS["who"] = np.arange(40) / 10, SKIN, b"wood"
 
 
-def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
-    """Dictionaries and None are passed over, without being unpickled."""
-    np.savez(
-        tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0]
-    )
-    found = raw_files.read(tmp_path / "a.npz", ReadPlan(time="t"))
-    np.testing.assert_array_equal(found.values, SKIN)
-    np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
-    np.savez(tmp_path / "b.npz", info={"skin": SKIN})
-    with pytest.raises(FormatError, match="0 arrays"):
-        raw_files.read(tmp_path / "b.npz")
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5"])
 def test_named_fields_are_columns(tmp_path: Path, suffix: str):
     """A field of several numbers is several columns; a field of text is a text column."""
@@ -68,11 +55,20 @@ def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
         raw_files.read(tmp_path / "a.h5", ReadPlan("camera"))
 
 
-def test_an_array_is_found_by_the_end_of_its_path(tmp_path: Path):
-    """`skin` names run/skin if no other array is called so."""
+def test_arrays_are_found_beside_others_and_beside_objects(tmp_path: Path):
+    """By the end of the path if it is one; dictionaries and None are never unpickled."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["run/skin"], file["run/camera"] = SKIN, np.zeros((3, 3))
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.h5", ReadPlan("skin")).values, SKIN)
+    np.savez(
+        tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0]
+    )
+    found = raw_files.read(tmp_path / "a.npz", ReadPlan(time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
+    np.savez(tmp_path / "b.npz", info={"skin": SKIN})
+    with pytest.raises(FormatError, match="0 arrays"):
+        raw_files.read(tmp_path / "b.npz")
 
 
 def test_vectors_are_columns(tmp_path: Path):

@@ -63,10 +63,12 @@ def test_separators_that_are_no_decimal_sign(tmp_path: Path, sign: str):
     assert ["thousands" in said for said in found.notes] == [True]
 
 
-def test_blanks_of_other_widths_separate_columns(tmp_path: Path):
-    """Without another sign they are not separators of thousands."""
+def test_signs_of_typographers_are_read(tmp_path: Path):
+    """Blanks of other widths separate columns, without another sign; U+2212 is a minus."""
     found = read(tmp_path, joined("\u00a0", "{}"))
     np.testing.assert_array_equal(found.values, SKIN)
+    found = read(tmp_path, joined(";", "\u2212{}"))
+    np.testing.assert_array_equal(found.values, -SKIN)
 
 
 def test_the_serial_monitors_clock_is_a_column(tmp_path: Path):
@@ -83,12 +85,6 @@ def test_the_serial_monitors_clock_is_a_column(tmp_path: Path):
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     assert found.columns == ("clock", "force", "b", "b", "b")
-
-
-def test_minus_signs_of_typographers(tmp_path: Path):
-    """U+2212 is a minus."""
-    found = read(tmp_path, joined(";", "\u2212{}"))
-    np.testing.assert_array_equal(found.values, -SKIN)
 
 
 def test_comments_behind_numbers_and_with_slashes(tmp_path: Path):
@@ -121,14 +117,10 @@ def test_a_bad_cell_is_still_named_by_its_line(tmp_path: Path, cell: str):
     assert f"line 8, column 2 is {cell!r}" in found.faults[1]
 
 
-def test_a_short_line_is_still_refused(tmp_path: Path):
-    """Its brackets do not hide that a number is missing."""
+def test_decorations_hide_no_missing_number_or_other_label(tmp_path: Path):
+    """Brackets around too few numbers, and another label, are faults."""
     with pytest.raises(FormatError, match="8 has 3"):
         raw_files.read(spoilt(tmp_path, "[1, 2, 3]"))
-
-
-def test_a_label_that_changes_is_a_fault(tmp_path: Path):
-    """Another label is another number."""
     lines = [labelled(",", ":")(row) for row in SKIN.tolist()]
     lines[7] = lines[7].replace("s1", "s9")
     (tmp_path / "a.txt").write_text("\n".join(lines))

@@ -55,18 +55,14 @@ def test_a_packed_store_and_other_archives(tmp_path: Path):
             raw_files.read(tmp_path / name)
 
 
-def test_several_arrays_and_wrong_ends(tmp_path: Path):
-    """Several arrays of frames are listed; ends of another number of frames are refused."""
+def test_a_store_of_several_arrays_counts_as_a_file(tmp_path: Path):
+    """They are listed, its chunks are not; ends of another number of frames are refused."""
     path = buffer(tmp_path / "a.zarr")
     with pytest.raises(FormatError, match="data/action"):
         raw_files.read(path)
     zarr.open_group(path, mode="a").create_array("data/short", data=SKIN[:9])
     with pytest.raises(FormatError, match="episode_ends"):
         raw_files.read(path, ReadPlan("data/short"))
-
-
-def test_a_store_counts_as_a_file(tmp_path: Path):
-    """Its chunks are not listed."""
     (tmp_path / "a.csv").write_text("1")
     buffer(tmp_path / "in" / "b.zarr")
     names = [path.relative_to(tmp_path).as_posix() for path in readers.files_below(tmp_path)]

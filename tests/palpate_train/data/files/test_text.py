@@ -91,10 +91,13 @@ def test_other_numbers_show_the_decimal_sign(cells: list[str], expected: list[fl
         np.testing.assert_allclose(found.values[0], expected)
 
 
-def test_two_decimal_signs_in_one_text_are_refused():
-    """0,5 beside 0.5: the cell is named."""
+def test_signs_that_could_be_either_are_refused():
+    """0,5 beside 0.5: the cell is named; 1,012 in quotes, as spreadsheets write it."""
     with pytest.raises(FormatError, match="'0,5'"):
         read("0,5\t0.25\n" * 4)
+    with pytest.raises(FormatError, match="column 2 is '1,012'"):
+        read('987,"1,012",5\n' * 4)
+    assert read('987,"1,012",5\n' * 4, ".").values[0].tolist() == [987, 1012, 5]
 
 
 @pytest.mark.parametrize(
@@ -112,13 +115,6 @@ def test_a_separator_at_a_wrong_place_is_a_fault(usual: str, cell: str, decimal:
     found = read(f"{usual};{usual}\n" * 5 + f"{usual};{cell}\n", decimal)
     assert found.faults.keys() == {1}
     assert "line 6, column 2" in found.faults[1]
-
-
-def test_quoted_thousands_between_commas_are_refused():
-    """Spreadsheets quote 1,012 in a CSV."""
-    with pytest.raises(FormatError, match="column 2 is '1,012'"):
-        read('987,"1,012",5\n' * 4)
-    assert read('987,"1,012",5\n' * 4, ".").values[0].tolist() == [987, 1012, 5]
 
 
 @pytest.mark.parametrize(
@@ -140,15 +136,11 @@ def test_what_follows_the_frames_is_said(end: str, note: str):
     assert any(note in said for said in check_whole(HEAD + BODY + end).notes)
 
 
-def test_text_between_frames_is_refused():
-    """A second head or a second table is not a footer."""
+def test_text_and_bytes_between_frames_are_refused():
+    """A second head or table, a block of NULs, a cell of 256 kB."""
     with pytest.raises(FormatError, match="32 has 1"):
         read(HEAD + BODY + "again\n" + BODY)
     assert read(HEAD + BODY + HEAD + BODY).faults[0].startswith("line 32, column 1 is 'a'")
-
-
-def test_bytes_in_the_middle_are_a_fault():
-    """A block of NULs, as a full disk leaves it; a cell of 256 kB."""
     fault = read(HEAD + BODY + "1,\0\0\0\0,3,4\n" + BODY).faults[1]
     assert fault.startswith("line 32, column 2")
     assert "\\x00\\x00" in fault
@@ -169,8 +161,10 @@ def test_a_text_column_stands_beside_numbers(at: int, text: str):
     assert found.columns[at] == "what"
 
 
-def test_rs_tables_are_read():
-    """write.table leaves the head one name short, write.csv leaves it empty."""
+def test_tables_of_pandas_and_r_are_read():
+    """A head ,0,1,2,3 with a count before each row; a head one name short or empty."""
+    rows = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(ROWS)]
+    check_whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
     rows = [f'"{k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
     check_whole("\n".join(['"a" "b" "c" "d"', *rows]))
     check_whole("\n".join(["a b c d", *(row.replace('"', "") for row in rows)]))
@@ -178,12 +172,6 @@ def test_rs_tables_are_read():
     check_whole("\n".join(["a\tb\tc\td", *(row.replace(" ", "\t") for row in rows)]))
     names = [f'"w {k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
     assert check_whole("\n".join(['"a" "b" "c" "d"', *names])).texts[0][0] == "w 1"
-
-
-def test_pandas_numbers_its_rows_and_columns():
-    """A nameless frame: a head ,0,1,2,3 and a first column that counts."""
-    rows = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(ROWS)]
-    check_whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -205,11 +193,15 @@ def test_rows_of_statistics_are_no_frames(word: str):
         assert any(word.strip('"') in said for said in found.notes)
 
 
-def test_ranges_below_names_are_no_names():
-    """Numbers with their unit; gains, types and spans repeat, as names do not."""
+def test_names_stand_on_the_last_line_before_the_numbers():
+    """Remarks above, units, ranges and gains below them are not the names."""
     check_whole("a,b,c,d\nRange=,10.000 V,5 mV,10 V\n" + BODY)
     for cell in ("x10", "uint8", "0 to 5 V", "-10-10 V", "5.0"):
         check_whole(f"a,b,c,d\ns,{cell},{cell},{cell}\n" + BODY)
+    check_whole("Recorded,by,hand,today\n" + HEAD + BODY)
+    check_whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
+    check_whole(HEAD + "N,N,N,V\n" + BODY)
+    check_whole("# " + HEAD + BODY)
 
 
 WIDE = [[7 * r + c * c for c in range(16)] for r in range(1, 31)]
@@ -231,14 +223,6 @@ def test_many_numbers_that_count_are_no_frame(count, form, word, before):
     np.testing.assert_array_equal(found.values[:, -16:], WIDE)
     if word == "label":
         assert len(read("\n".join([head.replace("label", "cork"), *rows])).values) == 31
-
-
-def test_names_stand_on_the_last_line_before_the_numbers():
-    """A remark with as many cells above it, and units below it, are not the names."""
-    check_whole("Recorded,by,hand,today\n" + HEAD + BODY)
-    check_whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
-    check_whole(HEAD + "N,N,N,V\n" + BODY)
-    check_whole("# " + HEAD + BODY)
 
 
 LVM = """LabVIEW Measurement\t
@@ -276,17 +260,13 @@ def test_labviews_measurements_are_read(sign: str, tail: str):
     np.testing.assert_allclose(found.values[:, 0], np.arange(30) / 100)
 
 
-def test_a_mark_shows_utf_16():
-    """With the mark it is read; names in Latin-1 are kept."""
+def test_decimal_commas_between_blanks_and_utf_16_are_read():
+    """1,5 2,5 are two numbers; with its mark UTF-16 is read, and Latin-1 names stay."""
+    assert read("1,5 2,5 3,25\n" * 5).values[0].tolist() == [1.5, 2.5, 3.25]
+    assert "column 1 is '1_000'" in read("1_000,2\n1,2\n1,2\n").faults[0]
     check_whole((HEAD + BODY).encode("utf-16"))
     assert read(("Größe,b,c,d\n" + BODY).encode("latin-1")).columns[0] == "Größe"
     assert read("Gro\u0308ße,b,c,d\n" + BODY).columns[0] == "Größe"
-
-
-def test_blanks_and_decimal_commas_go_together():
-    """1,5 2,5: blanks separate, not the comma."""
-    assert read("1,5 2,5 3,25\n" * 5).values[0].tolist() == [1.5, 2.5, 3.25]
-    assert "column 1 is '1_000'" in read("1_000,2\n1,2\n1,2\n").faults[0]
 
 
 @pytest.mark.parametrize("empty", [1, 2])

@@ -201,14 +201,10 @@ def test_filters_and_stride_follow_the_budgets(format: SweepFormat, filters: int
 
 
 def test_thresholds_leave_the_shares_that_were_drawn():
-    """The shares are those of the responses from which the thresholds were taken."""
+    """Of the responses that they are of; a window shorter than a filter is refused."""
     format = FORMATS[0]
     shares = run(trunk(format, small(format), False), counts(format, 12))[:, 40:].mean(axis=0)
     assert 0.05 < shares.min() < 0.25
     assert 0.75 < shares.max() < 0.95
-
-
-def test_a_window_shorter_than_a_filter():
-    """The message names the required length."""
     with pytest.raises(FormatError, match="8 frames"):
         bank.draw(SweepFormat(1, 1, 10.0, 8, "uint8"), np.random.default_rng(0), (False,))

@@ -130,27 +130,10 @@ def test_what_is_clearly_better_is_chosen():
 
 
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
-    """It is a discriminant of all magnitudes and one of all features, without copies."""
+    """All magnitudes and all features, without copies; loss alone is no reason."""
     at = scores()
     chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE), print)
     assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
-
-
-def test_a_factor_from_before_does_not_count():
-    """A part gets the same score again, alone and beside others, whatever its old factor."""
-    given, parts = known()
-    for factor in (1.0, 1e-3):
-        at = HeldOutScores([given] * 3, parts, 3)
-        both = at.score([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
-        fresh = HeldOutScores([given] * 3, parts, 3).score(
-            [HeadPart(GOOD, False), HeadPart(NOISE, False)]
-        )
-        assert both.plan == fresh.plan
-
-
-def test_loss_alone_is_no_reason():
-    """The same sweeps correct: neither is better, however sure of wrong answers."""
-    at = scores()
     one = at.score([HeadPart(GOOD, False)])
     wrong = one.logits.argmax(axis=1) != at.labels
     surer = replace(one, losses=one.losses + 5.0 * wrong)
@@ -269,7 +252,7 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """The usual candidate, magnitudes, without spectrum; then with it, and the spectrum alone."""
+    """The usual, magnitudes, without spectrum; where copies are wanted all see them."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 1 + 2
@@ -281,10 +264,6 @@ def test_candidates_are_what_the_features_allow():
     chosen = choice.choose(scores(), candidates([[0]], [0, 1], [2, 3]), tried.append)
     assert len(tried) == 2
     assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
-
-
-def test_every_discriminant_sees_copies_where_these_are_wanted():
-    """All see copies, so there are fewer; one without shows that they do no harm."""
     tried: list[str] = []
     heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
     chosen = choice.choose(scores(), heads, tried.append)
@@ -325,17 +304,13 @@ def spoiled(*noise: int) -> HeldOutScores:
     return HeldOutScores([replace(given, features=x, copied=copied)] * 3, parts, 3)
 
 
-def test_a_view_stays_away_where_it_harms():
-    """A view that helps within a group alone harms others and is not seen."""
+def test_views_and_copies_stay_away_where_they_harm():
+    """Where a view helps within a group alone, or another feature names the copies."""
     heads = candidates([[0, 1]], [0, 1], [0, 1], levels=[2, 3])
     harmed = choice.choose(spoiled(2, 3), heads, print)
     assert not {2, 3} & set(harmed.plan.columns().tolist())
     kept = choice.choose(scores(), candidates([[0]], [0], [0], levels=[1]), print)
     assert 1 in kept.plan.columns()
-
-
-def test_copies_stay_away_where_they_harm():
-    """Copies that are named by another feature than the sweeps spoil the heads that see them."""
     given, parts = known()
     rng = np.random.default_rng(2)
     mixed = given.features[rng.permutation(len(given.features))] * 3
@@ -355,25 +330,36 @@ def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
 
 
 def test_loads_join_where_held_out_groups_show_it():
-    """Loads that name the material in all groups join; in one session they may not."""
+    """Not in one session, and not where they mislead in the next."""
     at, columns = with_loads()
     joined = choice.choose(at, Candidates(columns, False, True), print)
     assert {1, 2} <= set(joined.plan.columns().tolist())
     alone = choice.choose(at, Candidates(columns, False, False), print)
     assert not {1, 2} & set(alone.plan.columns().tolist())
+    heads = candidates([[0, 1]], [0, 1], [0, 1], loads=[2, 4])
+    chosen = choice.choose(spoiled(2), heads, print)
+    assert not {2, 4} & set(chosen.plan.columns().tolist())
 
 
-def test_a_weight_is_the_size_of_logits_beside_others():
-    """Half the weight of a discriminant halves its logits in the sum, before the temperature."""
+def test_weights_count_and_factors_from_before_do_not():
+    """Half the weight halves the logits in the sum; the same score at any old factor."""
     at = scores()
     one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
     even, less = (at.score([one, replace(other, weight=weight)]).plan for weight in (1.0, 0.5))
     ratio = [plan.parts[1].factor / plan.parts[0].factor for plan in (even, less)]
     assert ratio[1] == pytest.approx(ratio[0] / 2)
+    given, parts = known()
+    for factor in (1.0, 1e-3):
+        at = HeldOutScores([given] * 3, parts, 3)
+        both = at.score([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
+        fresh = HeldOutScores([given] * 3, parts, 3).score(
+            [HeadPart(GOOD, False), HeadPart(NOISE, False)]
+        )
+        assert both.plan == fresh.plan
 
 
-def test_a_discriminant_that_is_mostly_wrong_does_not_outvote_others():
-    """Scaled to the same size as a good one, here it costs hardly anything."""
+def test_discriminants_are_scaled_alike():
+    """A mostly wrong one costs hardly anything; a missing material's logit sets no scale."""
     at = scores()
     good, noise = HeadPart(GOOD, False), HeadPart(NOISE, False)
     alone, both = at.accuracy(at.score([good])), at.score([good, noise])
@@ -384,10 +370,6 @@ def test_a_discriminant_that_is_mostly_wrong_does_not_outvote_others():
     given, _ = known()
     weights = [part.fit(given, 3)[0] for part in (good, noise)]
     assert ratio * np.abs(weights[0]).max() > np.abs(weights[1]).max()
-
-
-def test_a_material_that_a_part_lacks_does_not_set_the_scale():
-    """Its logit of -10,000 is far below all others, and says nothing of their size."""
     given, parts = known()
     lacking = replace(given, labels=np.where(given.labels == 2, 0, given.labels))
     one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
@@ -443,13 +425,6 @@ def test_relations_join_where_they_name_more_although_one_group_is_less_sure(
             if view == "related":
                 patched.setattr(Candidates, "loaded", lambda self, best: {})
             assert (choice.choose(at, heads, print) is named) == joins
-
-
-def test_loads_that_mislead_in_another_group_stay_away():
-    """The level of a session names its materials and misleads in the next."""
-    heads = candidates([[0, 1]], [0, 1], [0, 1], loads=[2, 4])
-    chosen = choice.choose(spoiled(2), heads, print)
-    assert not {2, 4} & set(chosen.plan.columns().tolist())
 
 
 def test_one_group_that_shows_the_opposite_suffices_against_loads():

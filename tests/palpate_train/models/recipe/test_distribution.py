@@ -84,8 +84,8 @@ def test_the_last_tenth_is_the_whole_window(format: SweepFormat):
         assert np.abs(prefixes[:, -1] - run(trunk(format, some, int8), given)).mean() < 1e-3
 
 
-def test_the_shares_of_training_sweeps_are_evenly_spaced():
-    """Levels are quantiles of the sweeps that they were fitted to."""
+def test_shares_are_evenly_spaced_and_free_of_offsets():
+    """Levels are quantiles of their sweeps; an offset changes no bit of bytes."""
     format = FORMATS[3]
     some = levels(format)
     number = some.levels.shape[2]
@@ -93,11 +93,6 @@ def test_the_shares_of_training_sweeps_are_evenly_spaced():
     wanted = 1 - (np.arange(number) + 0.5) / number
     assert np.abs(shares - wanted).max() < 0.1
     assert np.abs(shares.mean(axis=1) - wanted).max() < 0.05
-
-
-def test_an_offset_changes_nothing():
-    """An offset of all taxels changes no bit in int8 if counts are bytes."""
-    format = FORMATS[3]
     given = counts(format).clip(0, 200)
     model = trunk(format, levels(format), True)
     np.testing.assert_allclose(run(model, given + np.uint8(40)), run(model, given), atol=1e-2)

@@ -48,11 +48,14 @@ def test_memory_does_not_grow_with_the_set():
     assert most < memory.needed(large, USED), (most, memory.needed(large, USED))
 
 
-def test_a_set_under_the_cap_is_used_whole():
-    """Its results do not change with the cap."""
+def test_a_set_under_the_cap_is_used_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its results do not change with the cap; without a number nothing is refused."""
     s = easy(4)
     assert len(recipe.Setup.of(s, Run(1), Settings()).sweeps) == len(s)
     assert len(recipe.Setup.of(s, Run(1), Settings(most=6)).sweeps) == 6
+    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
+    monkeypatch.setattr(memory, "CGROUP", tmp_path / "none")
+    memory.check(easy(4), 10**9)
 
 
 @pytest.mark.parametrize(
@@ -74,12 +77,3 @@ def test_what_cannot_be_held_is_told_before(
     assert advice in str(e.value)
     if kilobytes > 300_000:
         memory.check(s, int(str(e.value).split("--most-sweeps ")[1].split(",")[0]))
-
-
-def test_a_system_that_does_not_say_refuses_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Then no estimate is compared."""
-    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
-    monkeypatch.setattr(memory, "CGROUP", tmp_path / "none")
-    memory.check(easy(4), 10**9)

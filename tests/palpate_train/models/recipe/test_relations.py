@@ -86,16 +86,12 @@ def test_they_are_the_deviations_and_correlations_of_the_window(format: SweepFor
     np.testing.assert_array_equal(features(format, later, used, True)[:, :5], tenths[:, :5])
 
 
-def test_few_scales_are_the_first_of_all():
-    """So a trunk that needs few has the same numbers as one that computes all."""
+def test_few_scales_are_the_first_and_silence_is_finite():
+    """A dead taxel has the least deviation, no correlation; equal ones the largest."""
     samples, size = woven(SLOW, np.random.default_rng(1)), relations.each(SLOW)
     every = features(SLOW, samples, relations.scales(SLOW), False)
     few = features(SLOW, samples, relations.SHORT, False)
     np.testing.assert_allclose(few, every[:, : relations.SHORT * size], atol=1e-5)
-
-
-def test_silent_and_equal_taxels_stay_finite():
-    """A dead taxel has the least deviation and no correlation; equal ones the largest."""
     samples = woven(SLOW, np.random.default_rng(2))
     samples[:, :, 3], samples[:, :, 5] = 100, samples[:, :, 4]
     found = features(SLOW, samples, 1, False)

@@ -69,8 +69,8 @@ def test_a_prefix_depends_on_no_later_frame(format: SweepFormat):
     np.testing.assert_array_equal(found, features(format, samples, True)[:, : PREFIXES // 2])
 
 
-def test_each_taxel_has_its_own_waves():
-    """A slow wave on one moves its features alone; so do tenths."""
+def test_each_taxel_or_cell_has_its_own_waves():
+    """A slow wave, or a tenth's, moves its features alone; at most 24 cells."""
     format = FORMATS[1]
     quiet = np.full((1, format.window, *format.shape), 100, format.numpy_type)
     for periods, tenth in ((3, False), (30, True)):
@@ -83,15 +83,11 @@ def test_each_taxel_has_its_own_waves():
         strongest = parts[tenth].max(axis=1)
         assert strongest.argmax() == 5
         assert np.delete(strongest, 5).max() < 0.1 < strongest[5]
+    large = replace(skin.FORMAT, window=128, rows=16, cols=32)
+    assert slow.count(large) == 24 * slow.count(FORMATS[1]) // 16
 
 
 @pytest.mark.parametrize("window", [8, 39])
 def test_a_short_window_has_none(window: int):
     """A tenth has too few frames."""
     assert slow.count(replace(skin.FORMAT, window=window)) == 0
-
-
-def test_a_large_skin_is_divided_into_cells():
-    """As for relations: at most 24 cells."""
-    large = replace(skin.FORMAT, window=128, rows=16, cols=32)
-    assert slow.count(large) == 24 * slow.count(FORMATS[1]) // 16
