@@ -112,13 +112,16 @@ MEASURED = (
 """The optional fields of an answer, and the two registers."""
 
 
-def test_the_measured_slide_is_read(box, raw):
-    """Tenths of mm/s and a code; 0 where RES has none or a later one; not writable."""
+def test_the_measured_slide_is_read_and_zero_before(box, raw):
+    """Tenths of mm/s and a code, not writable; before anything was heard all are zero."""
     for number, (optional, words) in enumerate(MEASURED, 1):
         box.say(result(number, optional=optional))
         eventually(lambda number=number: word(raw, "answers") == number)
         assert raw.registers(MEASURED_AT, 2) == words, optional
     assert modbus.SLIDE_AT + len(modbus.SLIDE) == MEASURED_AT
+    words = registers(BoxView(), alive=False)
+    assert {i: w for i, w in enumerate(words) if w} == {0: 1, ADDRESSES["status"]: STALE}
+    assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
 
 
 FINGERS_AT = 44
@@ -384,13 +387,6 @@ def test_each_status_has_its_code(status):
     assert words[ADDRESSES["label code"]] == (2 if status is Status.OK else 0)
     assert words[ADDRESSES["likeliest label code"]] == (2 if status.classified else 0)
     assert words[ADDRESSES["latency"]] == 65535  # more than fits
-
-
-def test_before_anything_was_heard():
-    """All zero except the version and the entries for a box that is not heard."""
-    words = registers(BoxView(), alive=False)
-    assert {i: w for i, w in enumerate(words) if w} == {0: 1, ADDRESSES["status"]: STALE}
-    assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
 
 
 def test_the_python_of_the_page_runs(box, raw, address):

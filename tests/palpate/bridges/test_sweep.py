@@ -175,12 +175,16 @@ def test_what_becomes_of_a_sweep(swept, monkeypatch, name):
         assert swept.run().known
 
 
-def test_start_has_the_speed_and_force_of_the_goal(swept):
-    """0 is not sent."""
+def test_a_sweep_has_its_own_goal_and_answer(swept):
+    """0 is not sent; an answer that came before START is forgotten."""
     for terms in ({"speed_mm_s": 30.5}, {"force_n": 1.5}, {}):
         swept.run(**terms)
     started = [s.fields for s in swept.box.heard if s.kind == "START"]
     assert started == [["30.5"], ["", "1.5"], []]
+    swept.box.script = saying()
+    swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
+    with pytest.raises(NoAnswer):
+        swept.run(timeout_s=0.3)
 
 
 def test_canceled_when_the_answer_came(swept):
@@ -195,14 +199,6 @@ def test_canceled_when_the_answer_came(swept):
     with pytest.raises(CommandRefused, match="canceled"):
         swept.run()
     assert swept.has_heard("START", "ABORT")
-
-
-def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept):
-    """What came before START is forgotten."""
-    swept.box.script = saying()
-    swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
-    with pytest.raises(NoAnswer):
-        swept.run(timeout_s=0.3)
 
 
 def test_a_box_that_falls_silent(swept):

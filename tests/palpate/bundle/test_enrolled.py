@@ -74,17 +74,6 @@ def test_the_bundle_stays_as_it_is(base, made, tmp_path):
     assert new.id != old.id
 
 
-def test_what_an_enrolment_cannot_say_is_computed(made):
-    """Bias and shape follow from mean and number; the file has neither."""
-    assert set(content(made)) == set(enrolled.ARRAYS)
-    louder = changed(made, bias=np.float32([1e6, 1e6]), means_of_wood=np.zeros((3, 2), np.float32))
-    new, old = bundle.from_files(louder, "louder"), bundle.from_files(made, "made")
-    assert new.classes
-    assert old.classes
-    for name, values in old.classes.arrays().items():
-        assert new.classes.arrays()[name].tobytes() == values.tobytes()
-
-
 def check_refused(files: dict[str, bytes], why: str) -> None:
     """The files give no bundle, for this reason, in one line."""
     with pytest.raises(BundleError, match=why) as e:
@@ -166,17 +155,24 @@ def test_a_file_that_is_no_npz_is_refused(made):
     check_refused(made | {bundle.ENROLMENT: bomb.getvalue()}, "unpacks to .* bytes")
 
 
-def test_a_bundle_without_class_means_takes_no_labels(made):
-    """The labels cannot be added without class means."""
+def test_bias_and_shape_are_computed_from_class_means(made):
+    """From mean and number of a label; without class means no label is added."""
     plain = toy_bundle.files(known=None, outputs=("logits",))
     base = np.array(bundle.digest(plain[bundle.MANIFEST]))
     check_refused(
         plain | {bundle.ENROLMENT: changed(made, base=base)[bundle.ENROLMENT]}, "has no class means"
     )
+    assert set(content(made)) == set(enrolled.ARRAYS)
+    louder = changed(made, bias=np.float32([1e6, 1e6]), means_of_wood=np.zeros((3, 2), np.float32))
+    new, old = bundle.from_files(louder, "louder"), bundle.from_files(made, "made")
+    assert new.classes
+    assert old.classes
+    for name, values in old.classes.arrays().items():
+        assert new.classes.arrays()[name].tobytes() == values.tobytes()
 
 
-def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(base, made):
-    """A forged label can only win itself."""
+def test_labels_leave_the_order_of_others(base, made):
+    """A forged label can only win itself; class codes stay in the order of enrolment."""
     forged = changed(made, means=np.float32([[6, 0], [0, 0]]), spread=np.float32([1e6, 1e6]))
     it, before = (
         Classifier(bundle.from_files(files, "toy"), SystemClock()) for files in (forged, base)
@@ -184,10 +180,6 @@ def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(base, made):
     for z in ((0, 0), (6, 0), (0, 6), (3, 1)):
         scores = [run.logits(toy_bundle.window(*z))[:3] for run in (it, before)]
         assert np.argsort(scores[0]).tolist() == np.argsort(scores[1]).tolist()
-
-
-def test_labels_are_read_in_the_order_in_which_they_were_enrolled(base):
-    """So the class codes of all other labels stay the same. The same labels give the same bytes."""
     one, other = grown(grown(base, "felt"), "cork"), grown(grown(base, "cork"), "felt")
     first, second = (bundle.from_files(files, "toy") for files in (one, other))
     assert (first.manifest.labels[3:], second.manifest.labels[3:]) == (

@@ -44,17 +44,6 @@ def box(speaking: SpeakingBox) -> Iterator[Palpate]:
         yield client
 
 
-def test_a_sweep_by_command(speaking, box):
-    """The example of the module: ready, START, STOP, the answer."""
-    box.new_object()
-    box.start()
-    box.stop()
-    answer = box.result(LONG_S)
-    assert (answer.known, answer.label, answer.latency_ms) == (True, "wood", 1.25)
-    assert [s.kind for s in speaking.heard][-3:] == ["NEW", "START", "STOP"]
-    assert all(s.summed for s in speaking.heard)
-
-
 @pytest.mark.parametrize(
     ("values", "fields"),
     [
@@ -71,13 +60,20 @@ def test_start_has_speed_and_force(speaking, box, values, fields):
     assert speaking.heard[-1].fields == fields
 
 
-def test_what_the_box_is(box):
-    """State, identity, labels and tare."""
+def test_a_sweep_by_command_and_what_the_box_is(box, speaking):
+    """The example of the module; then state, identity, labels and tare."""
     assert box.state().frames == 3000
     assert (box.identify().name, box.identify().skin) == ("mine", "skin-4x4 A0017 1.2.0")
     assert box.labels() == LABELS
     assert box.ask("LABEL,1") == box.ask("LABEL", "1")
     assert box.tare() == "16 taxels"
+    box.new_object()
+    box.start()
+    box.stop()
+    answer = box.result(LONG_S)
+    assert (answer.known, answer.label, answer.latency_ms) == (True, "wood", 1.25)
+    assert [s.kind for s in speaking.heard][-3:] == ["NEW", "START", "STOP"]
+    assert all(s.summed for s in speaking.heard)
 
 
 def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking, box):
@@ -95,16 +91,6 @@ def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking, box):
     speaking.say(result(8))
     assert box.result(LONG_S).fingers == ()
     assert box.damaged == 0
-
-
-def test_an_old_answer_is_not_taken_for_a_new_one(speaking, box):
-    """A late answer to an abandoned sweep is dropped by `wait_ready` and by `start`."""
-    for forget in (lambda: box.wait_ready(LONG_S), box.start):
-        speaking.say(result(8, label="paper"))
-        box.state()  # its answer comes after that
-        forget()
-        with pytest.raises(NoAnswer):
-            box.result(SHORT_S)
 
 
 def test_answers_are_given_in_order_with_their_gaps(speaking):
@@ -283,8 +269,8 @@ def test_a_port_that_is_not_there(tmp_path):
         box.wait_ready(SHORT_S)
 
 
-def test_the_oldest_of_too_many_answers_is_dropped(speaking, box):
-    """A program that never asks costs no memory; the loss is counted."""
+def test_old_answers_are_dropped(speaking, box):
+    """Of too many the oldest, counted; a late one by `wait_ready` and by `start`."""
     for number in range(1, KEPT + 3):
         speaking.say(result(number))
         if number % 16 == 0:
@@ -292,6 +278,12 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking, box):
     box.state()
     assert box.result(LONG_S).sweep == 3
     assert box.missed == 2
+    for forget in (lambda: box.wait_ready(LONG_S), box.start):
+        speaking.say(result(8, label="paper"))
+        box.state()  # its answer comes after that
+        forget()
+        with pytest.raises(NoAnswer):
+            box.result(SHORT_S)
 
 
 def test_more_than_a_pseudo_terminal_holds_arrives_whole(speaking, box):

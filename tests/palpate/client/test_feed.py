@@ -50,8 +50,8 @@ def feed(tmp_path: Path) -> Iterator[Feed]:
         yield one
 
 
-def test_lines_come_whole_however_they_are_split():
-    """At every byte: the same lines, and the rest that was not ended."""
+def test_lines_come_whole_and_a_loop_ends_with_the_reason(feed, monkeypatch):
+    """Split at every byte; without a box an error with exit code 69."""
     data = HELLO + b'{"type": "health", "skin": "r\\u00e4u"}\n{"type'
     whole, rest = parse(data)
     assert [line["type"] for line in whole] == ["hello", "health"]
@@ -60,6 +60,10 @@ def test_lines_come_whole_however_they_are_split():
         first, left = parse(data[:cut])
         then, left = parse(data[cut:], left)
         assert (first + then, left) == (whole, rest)
+    monkeypatch.setattr(Feed, "read", lambda self, timeout_s: None)
+    with pytest.raises(FeedError, match="nothing") as e:
+        next(iter(feed))
+    assert e.value.exit_code == 69
 
 
 @pytest.mark.parametrize(
@@ -122,14 +126,6 @@ def test_without_a_box_it_says_what_to_do(feed, tmp_path):
     file = Feed(tmp_path)
     assert file.read(0) is None
     assert file.trouble
-
-
-def test_a_loop_over_lines_ends_with_the_reason(feed, monkeypatch):
-    """`for line in feed` without a box is an error with exit code 69."""
-    monkeypatch.setattr(Feed, "read", lambda self, timeout_s: None)
-    with pytest.raises(FeedError, match="nothing") as e:
-        next(iter(feed))
-    assert e.value.exit_code == 69
 
 
 def test_a_box_is_read_and_its_reason_is_kept(tmp_path):

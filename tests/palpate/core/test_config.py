@@ -158,13 +158,6 @@ def test_a_missing_board_lists_the_boards_there(folder, board):
             _load(folder, board)
 
 
-def test_only_the_site_file_may_choose_the_board(folder):
-    """`board` in skin.toml would be read too late."""
-    (folder / "skin.toml").write_text('board = "a"\n')
-    with pytest.raises(ConfigError, match=r"skin\.toml.*--board"):
-        _load(folder)
-
-
 def test_a_line_with_two_meanings_is_refused(folder):
     """Across layers and inside class_bits; the message has both roles and both sources."""
     with pytest.raises(ConfigError) as e:
@@ -239,11 +232,14 @@ def test_each_field_is_explained(section):
     ] == []
 
 
-def test_skin_toml_shows_every_skin_setting_as_the_code_has_it():
-    """The shipped skin.toml is complete and changes nothing."""
+def test_the_shipped_skin_toml_is_complete_and_names_no_board(folder):
+    """It changes nothing; `board` there would be read too late."""
     table = tomllib.loads((FIRMWARE / "skin.toml").read_text())
     known = schema.keys(config.SkinConfig)
     assert table == {"skin": {name: key.default for name, key in known.items()}}
+    (folder / "skin.toml").write_text('board = "a"\n')
+    with pytest.raises(ConfigError, match=r"skin\.toml.*--board"):
+        _load(folder)
 
 
 _ODD = "3V3 2 3 4 GND 17 27 22 3V3 10 9 11 GND ID_SD 5 6 13 19 26 GND"

@@ -59,8 +59,8 @@ def test_the_closest_names_are_proposed():
     assert closest("zzz", known, 3) == []
 
 
-def test_a_typed_name_keeps_its_label():
-    """Typed again it has the same; another name and a material without display name keep theirs."""
+def test_names_keep_labels_and_take_none_of_the_bundle():
+    """Typed again the same; both forms of Unicode are one word, other scripts take no label."""
     known = TypedNames()
     known.add("Filz weiss", None)
     known.add("Holz", "Holz, geölt")
@@ -70,10 +70,6 @@ def test_a_typed_name_keeps_its_label():
     for bad in ("a\nb", "ä\nb", "-wood", "<b>", ""):
         assert known.label(bad) == bad
     assert known.displays == {"Holz": "Holz, geölt", "Filz weiss 2": "Filz weiß"}
-
-
-def test_labels_of_the_bundle_are_taken():
-    """Another script gets no taken label; both forms of Unicode are one word."""
     known = TypedNames()
     known.add("material", None)
     known.add("Spuele", "Spu\u0308le")

@@ -192,17 +192,13 @@ def test_a_bad_bundle_is_refused_and_leaves_nothing(box, name):
     assert [p.name for p in box.store.bundles.folder.glob("*")] == [one] * bool(one)
 
 
-def test_what_else_lies_there_is_not_taken(box):
-    """A file that the manifest does not name is not copied."""
+def test_what_was_checked_is_written_and_nothing_else(box):
+    """Files changed after the check, and files that the manifest does not name, are not copied."""
     folder = box.made(1)
     (folder / "extra").write_bytes(b"x")
     sha = box.store.install(folder)
     names = {bundle.MANIFEST, bundle.SIGNATURE, bundle.MODEL, bundle.GOLDEN, bundle.MEANS}
     assert {p.name for p in box.store.bundles.at(sha).iterdir()} <= names
-
-
-def test_what_was_checked_is_what_is_written(box):
-    """The owner of the folder changes it after the check: the checked files are installed."""
     folder = box.made(1)
 
     def change(held: Bundle) -> None:

@@ -240,8 +240,8 @@ def test_numbered_lines_are_described_by_a_command(name: str, tmp_path: Path) ->
     np.testing.assert_array_equal(found.taxels, [source.frame(i) for i in range(40)])
 
 
-def test_requests_of_many_registers() -> None:
-    """They cover all registers, none holds more than 125, and their lengths differ."""
+def test_requests_of_many_registers_have_length_and_checksum() -> None:
+    """All registers, 125 at most each; the length of the numbers and the sum are put in."""
     for rows, cols in ((1, 1), (5, 25), (16, 16), (32, 32), (60, 60)):
         profile = replace(KINDS["registers"].profile, rows=rows, cols=cols)
         counts = [int.from_bytes(r[4:6], "big") for r in requests(profile)]
@@ -250,6 +250,11 @@ def test_requests_of_many_registers() -> None:
         assert sum(counts) == rows * cols
         assert max(counts) <= 125
         assert len(set(counts)) == len(counts)
+    keys = {"poll": ("hex:55 {bytes} {crc16-modbus} 0d",), "codec": "fixed", "marker": b"\xaa"}
+    profile = SkinProfile(about="a", source="s", rows=3, cols=100, **keys)  # type: ignore[arg-type]
+    before = b"\x55\x2c\x01"
+    assert requests(profile) == [before + crc16(before) + b"\x0d"]
+    assert checksums.NAMED["crc16-modbus"].of(before) == int.from_bytes(crc16(before), "little")
 
 
 @pytest.mark.parametrize(
@@ -280,15 +285,6 @@ def test_types_of_values(kinds: str) -> None:
     found = skin_codecs.codec(profile)(Rest(), 4 * (b"\xaa\x55" + wire))
     wanted = [np.array(v).astype(t).item() for v, t in zip(values, types, strict=True)]
     assert found.taxels[0].ravel().tolist() == wanted
-
-
-def test_requests_with_a_checksum() -> None:
-    """The length of the numbers and the checksum are put into a request."""
-    keys = {"poll": ("hex:55 {bytes} {crc16-modbus} 0d",), "codec": "fixed", "marker": b"\xaa"}
-    profile = SkinProfile(about="a", source="s", rows=3, cols=100, **keys)  # type: ignore[arg-type]
-    before = b"\x55\x2c\x01"
-    assert requests(profile) == [before + crc16(before) + b"\x0d"]
-    assert checksums.NAMED["crc16-modbus"].of(before) == int.from_bytes(crc16(before), "little")
 
 
 ONE_BYTE = 'codec = "segments"\nmarker = "aa"\nskip_before = 1\n'

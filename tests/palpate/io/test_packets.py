@@ -31,7 +31,7 @@ def frames_of(packets: list[wire.Packet]) -> dict[int, bytes]:
 
 
 def test_bytes_are_the_documents_table():
-    """A packet built by hand from PROTOCOL.md's table is what `pack` writes."""
+    """Built by hand from PROTOCOL.md; too large a packet is not built."""
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 1, 2, 2, 2, 0, 0, 0xFFFFFFFF, 7)
     by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
@@ -39,6 +39,8 @@ def test_bytes_are_the_documents_table():
         wire.pack(0xFFFFFFFF, 7, np.arange(8, dtype=np.uint8).reshape(2, 2, 2), wire.Flag.TRIGGER)
         == by_hand
     )
+    with pytest.raises(FormatError, match="4096"):
+        wire.pack(0, 0, np.zeros((255, 5, 5), np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -156,16 +158,12 @@ def test_follow_accounts_for_every_frame(order, first):
         assert starts[0] == first + 3 * order[0] - (2**32 if first + 3 * order[0] >= 2**32 else 0)
 
 
-def test_follow_wraps():
-    """The 32-bit count wraps without loss."""
+def test_counts_wrap_or_restart():
+    """At 32 bits without loss; far back a new epoch begins, nothing is lost or adjacent."""
     packets = wire.unpack(b"".join(stream(3, first=2**32 - 4))).packets
     fresh, _, lost, stale = wire.follow(packets, wire.StreamPosition(2))
     assert [s - (2 << EPOCH_BITS) for s, _ in fresh] == [2**32 - 4, 2**32 - 1, 2**32 + 2]
     assert (lost, stale) == (0, 0)
-
-
-def test_follow_takes_a_count_far_back_as_restart():
-    """A board that begins at 0 starts a new epoch: nothing is lost, nothing adjacent."""
     packets = wire.unpack(stream(1, first=900_000)[0] + stream(1, first=0)[0]).packets
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     assert [s for s, _ in fresh] == [900_000, 1 << EPOCH_BITS]
@@ -208,9 +206,3 @@ def test_broken_replies_are_named(call, value, hint):
     """A reply that is too short or has an unknown data type is a FormatError with the reason."""
     with pytest.raises(FormatError, match=hint):
         call(value)
-
-
-def test_too_large_a_packet_is_refused():
-    """A packet that no box would accept is not built."""
-    with pytest.raises(FormatError, match="4096"):
-        wire.pack(0, 0, np.zeros((255, 5, 5), np.uint8))

@@ -134,17 +134,13 @@ def test_no_reply(line, sent, hint):
             link.request(packets.Request.FORMAT, 64)
 
 
-def test_what_came_before_the_port_was_opened_is_not_read(line):
-    """Bytes from before are discarded, since they would be taken for new frames."""
+def test_bytes_pass_from_the_opening_on(line):
+    """All values, b"" in time, cut at `size`; earlier bytes would be taken for frames."""
     far, path = line
     os.write(far, b"old")
     with closing(SerialLink(path, 115200, CLOCK)) as link:
         os.write(far, b"new")
         assert link.read(10, 1000) == b"new"
-
-
-def test_read_and_write(line):
-    """All byte values pass; none in time is b""; a longer text is cut at `size`."""
     far, path = line
     with closing(SerialLink(path, 2_000_000, CLOCK)) as link:
         assert link.read(10, 1) == b""
@@ -179,15 +175,11 @@ def test_a_port_that_takes_nothing(line, monkeypatch):
         link.write(bytes(1_000_000))
 
 
-def test_a_port_that_another_program_holds(line):
-    """Held by a lock: busy; free again after it."""
+def test_a_port_has_one_program_and_keeps_dtr(line, monkeypatch):
+    """Busy under a lock, errno 11 for others; DTR, which restarts boards, stays."""
     with serial.Serial(line[1], exclusive=True), pytest.raises(SensorBusy, match="another"):
         SerialLink(line[1], 115200, CLOCK)
     SerialLink(line[1], 115200, CLOCK).close()
-
-
-def test_others_are_kept_out_and_dtr_stays(line, monkeypatch):
-    """Others get errno 11 meanwhile; closing keeps DTR, which restarts many boards."""
     link = SerialLink(line[1], 115200, CLOCK)
     with open(line[1], "rb", buffering=0) as other:
         with pytest.raises(BlockingIOError):
@@ -226,7 +218,7 @@ def test_a_file_that_is_not_a_serial_port(path):
 
 
 def test_ids_find_the_port(tmp_path):
-    """The first port with the ids and the serial number; without one, all are named."""
+    """The first with ids and serial number, also those of the settings; else all are named."""
     ports = [
         PortInfo("/dev/ttyS0"),
         PortInfo("/dev/ttyUSB0", 0x1A86, 0x7523, "", "USB Serial"),
@@ -239,10 +231,6 @@ def test_ids_find_the_port(tmp_path):
         serial_link.find([(0x2E8A, 5)], "c", ports)
     with pytest.raises(SensorAbsent, match="none"):
         serial_link.find([(0x2E8A, 5)], "", [])
-
-
-def test_the_configured_ids_are_looked_for():
-    """Without skin.port the ids of the settings choose."""
     config = SkinConfig(link="serial", usb="2e8a:0005")
     with pytest.raises(SensorAbsent, match="2e8a:0005"):
         serial_link.open_readout(config, CLOCK, lambda: [PortInfo("/dev/ttyACM0", 0x1209, 0x7AC7)])

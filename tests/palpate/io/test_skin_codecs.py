@@ -24,18 +24,18 @@ def decoded(p: SkinProfile, data: bytes) -> Decoded:
 
 
 def test_a_matrix_byte_by_byte():
-    """AA 55 and six bytes, three times: two frames, since no mark follows the third yet."""
+    """Two frames of three, no mark follows yet; noise but its last byte; a count behind."""
     frame = bytes.fromhex("aa55 010203040506")
     found = decoded(SMALL, frame * 3)
     assert found.taxels.tolist() == [[[1, 2, 3], [4, 5, 6]]] * 2
     assert found.ends.tolist() == [8, 16]
     assert (found.garbage, found.rest.data, found.rest.synced) == (0, frame, True)
-
-
-def test_noise_leaves_what_may_begin_a_mark():
-    """All bytes but the last are garbage at once: it may be the first of a mark."""
     found = decoded(SMALL, bytes(100))
     assert (len(found), found.garbage, found.rest.data) == (0, 99, b"\0")
+    p = replace(SMALL, sequence="uint8", sequence_at=6)
+    found = decoded(p, b"".join(b"\xaa\x55" + bytes([i] * 6) + bytes([i + 9]) for i in range(5)))
+    assert found.counts.tolist() == [9, 10, 11, 12]
+    assert found.taxels[1].tolist() == [[1, 1, 1], [1, 1, 1]]
 
 
 @pytest.mark.parametrize("cut", [0, 3])
@@ -110,14 +110,6 @@ def test_a_frame_with_count_checksum_and_ignored_bytes():
     assert len(counts) >= len(good) - 1
 
 
-def test_a_count_behind_the_numbers():
-    """The count may stand behind the numbers."""
-    p = replace(SMALL, sequence="uint8", sequence_at=6)
-    found = decoded(p, b"".join(b"\xaa\x55" + bytes([i] * 6) + bytes([i + 9]) for i in range(5)))
-    assert found.counts.tolist() == [9, 10, 11, 12]
-    assert found.taxels[1].tolist() == [[1, 1, 1], [1, 1, 1]]
-
-
 TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="float32", rows=1)
 
 
@@ -173,8 +165,13 @@ def test_the_value_that_does_not_fit_is_named(number, line, misfit):
     assert misfit in found.misfit
 
 
-def test_only_lines_with_the_prefix_are_read():
-    """Others are neither frames nor garbage; a damaged beginning is."""
+def test_lines_between_other_lines():
+    """A frame ends with another line; without the prefix a line is neither frame nor garbage."""
+    p = replace(TEXT, lines="rows", rows=2, cols=2)
+    for text in (b"1 2\n3 4\n---\n", b"1,2\n3,4\nFrame 12\n", b"[[1 2]\n [3 4]]\n"):
+        found = decoded(p, text * 3)
+        assert found.taxels.tolist() == [[[1, 2], [3, 4]]] * 3, text
+    assert len(decoded(p, b"1 2\n3 4\n5 6x\n\n")) == 0  # a third row, damaged
     p = replace(TEXT, cols=4, prefix="P:")
     other, wanted = b"T: 21.5\nL,1,2,3,4\n\n" * 5, b"P:1,2,3,4\n"
     found = decoded(p, (other + wanted) * 4)
@@ -186,15 +183,6 @@ def test_only_lines_with_the_prefix_are_read():
     assert len(decoded(p, b"P:1,2,3,4P:1,2,3,4\n" + wanted)) == 1
     with pytest.raises(ConfigError, match="prefix"):
         replace(p, lines="rows")
-
-
-def test_rows_between_other_lines():
-    """A line of other text, or the end of a printed array, ends a frame of several lines."""
-    p = replace(TEXT, lines="rows", rows=2, cols=2)
-    for text in (b"1 2\n3 4\n---\n", b"1,2\n3,4\nFrame 12\n", b"[[1 2]\n [3 4]]\n"):
-        found = decoded(p, text * 3)
-        assert found.taxels.tolist() == [[[1, 2], [3, 4]]] * 3, text
-    assert len(decoded(p, b"1 2\n3 4\n5 6x\n\n")) == 0  # a third row, damaged
 
 
 def test_anyskin_byte_by_byte():
@@ -246,8 +234,8 @@ def test_papillarray_byte_by_byte():
     assert len(decoded(p, papillarray(np.ones((3, 3, 6)), 65_536 + 3 - 1000))) == 1
 
 
-def test_papillarray_with_a_tail_inside():
-    """AA BB CC DD among the numbers does not end the packet, since the sum does not fit there."""
+def test_papillarray_of_two_sensors_with_a_tail_inside():
+    """AA BB CC DD ends no packet where the sum does not fit; 6x3, not 3x3."""
     p = profile("papillarray")
     grid = np.zeros((3, 3, 6), np.float32)
     grid[1, 1, 2] = struct.unpack("<f", b"\xaa\xbb\xcc\xdd")[0]
@@ -255,6 +243,13 @@ def test_papillarray_with_a_tail_inside():
     assert len(found) == 2
     assert found.taxels[0, 1, 1, 2] == grid[1, 1, 2]
     assert found.garbage == 0
+    grid = np.arange(108, dtype=np.float32).reshape(6, 3, 6)
+    data = papillarray(grid, 1, sensors=2)
+    found = decoded(replace(profile("papillarray"), rows=6), data)
+    assert found.taxels[0].tolist() == grid[..., :3].tolist()
+    wrong = decoded(profile("papillarray"), data)
+    assert len(wrong) == 0
+    assert "18 pillars" in wrong.wrong
 
 
 def test_a_packet_of_another_form_is_read_by_its_own_table():
@@ -273,17 +268,6 @@ def test_a_packet_of_another_form_is_read_by_its_own_table():
         assert found.taxels.tobytes() == b"".join(one.taxels.tobytes() for one in alone), at
         assert found.counts.tolist() == [n for one in alone for n in one.counts.tolist()], at
         assert len(found.skipped) == len(found.ends) == len(found.taxels)
-
-
-def test_papillarray_of_two_sensors():
-    """They are 6x3, one below the other; with a profile of 3x3 another skin is named."""
-    grid = np.arange(108, dtype=np.float32).reshape(6, 3, 6)
-    data = papillarray(grid, 1, sensors=2)
-    found = decoded(replace(profile("papillarray"), rows=6), data)
-    assert found.taxels[0].tolist() == grid[..., :3].tolist()
-    wrong = decoded(profile("papillarray"), data)
-    assert len(wrong) == 0
-    assert "18 pillars" in wrong.wrong
 
 
 def test_xela_byte_by_byte():

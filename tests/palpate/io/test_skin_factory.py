@@ -41,12 +41,14 @@ def test_each_profile_has_its_sensor_and_form(name):
     assert isinstance(skins.sensor(chosen, profile(name).format, simulated), SerialSensor)
 
 
-def test_the_protocol_has_the_old_sensor():
-    """The profile `palpate` is read as before, and its readout board is asked for the format."""
+def test_the_protocol_has_the_old_sensor_and_a_wrong_profile_none():
+    """Its board is asked for the format; a wrong name is not guessed."""
     simulated = idle_devices()
     chosen = simulated.wire(settings("skin.profile=flexitac", "skin.grid=3x3"))
     assert isinstance(skins.sensor(chosen, skin.FORMAT, simulated), UsbSensor)
     assert skins.announced(chosen, simulated) == skin.FORMAT
+    with pytest.raises(ConfigError, match="flexitac"):
+        skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 
 
 def test_a_rate_that_can_be_set_is_that_of_the_bundle():
@@ -65,12 +67,6 @@ def test_a_form_that_a_person_describes():
         skins.described("5x3")
     with pytest.raises(ConfigError, match="0x3:int16:9"):
         skins.described("0x3:int16:9")
-
-
-def test_a_wrong_profile_is_named():
-    """The profile is not guessed."""
-    with pytest.raises(ConfigError, match="flexitac"):
-        skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 
 
 @pytest.fixture

@@ -80,8 +80,8 @@ def test_a_wrong_file(tmp_path, text, hint):
     assert "\n" not in str(e.value)
 
 
-def test_names(tmp_path):
-    """Misspelt, out of the folder, empty; the first folder first; `palpate` needs no file."""
+def test_names(tmp_path, monkeypatch):
+    """Misspelt, out of the folder, empty; own profiles come first; `palpate` has none."""
     folder = written(tmp_path, GOOD)
     with pytest.raises(ConfigError, match="oven"):
         load("oven", [folder])
@@ -96,6 +96,10 @@ def test_names(tmp_path):
     assert load("palpate", [folder]) == SkinProfile()
     with pytest.raises(ConfigError, match="none"):
         load("own", [tmp_path / "nowhere"])
+    monkeypatch.setattr(skins, "OWN", written(tmp_path, GOOD))
+    settings = config.load(None, ["skin.profile=own", "skin.grid=2x3"], site=NO_SITE)
+    assert settings.folder == ROOT / "firmware_config"
+    assert (skins.profile(settings).rows, skins.profile(settings).cols) == (2, 3)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -126,20 +130,6 @@ def test_modem_manager_leaves_each_skin_alone():
     )
     assert sorted(f"{ids[1]}:{ids[2]}" for ids in named if ids) == sorted(
         usb_id for name in NAMES for usb_id in profile(name).usb_ids
-    )
-
-
-def test_what_each_lacks():
-    """Only a skin that counts its frames shows its loss."""
-    assert {name: profile(name).lacks for name in NAMES} == {
-        name: ()
-        if name == "papillarray"
-        else ("sequence", "time", "checksum")[: 2 if name in SUMMED else 3]
-        for name in NAMES
-    }
-    assert SkinProfile(codec="fixed", marker=b"\xaa", sequence="uint8").lacks == (
-        "time",
-        "checksum",
     )
 
 
@@ -184,35 +174,33 @@ def test_settings_that_do_not_fit(name, settings, hint):
     assert hint in str(e.value)
 
 
-def test_grid_is_not_for_the_protocol():
-    """A readout board of PROTOCOL.md announces its grid itself."""
+def test_what_each_lacks():
+    """Only a skin that counts its frames shows loss; PROTOCOL.md announces its grid itself."""
     for settings in ({"grid": "4x4"}, {"rate_hz": 100.0}):
         with pytest.raises(ConfigError, match=r"skin\..*PROTOCOL"):
             adapted(SkinProfile(), SkinConfig(**settings))
+    assert {name: profile(name).lacks for name in NAMES} == {
+        name: ()
+        if name == "papillarray"
+        else ("sequence", "time", "checksum")[: 2 if name in SUMMED else 3]
+        for name in NAMES
+    }
+    assert SkinProfile(codec="fixed", marker=b"\xaa", sequence="uint8").lacks == (
+        "time",
+        "checksum",
+    )
 
 
-def test_commands():
-    """Rate and period are put in, as text or as a byte; bytes pass unchanged."""
+def test_commands_and_slow_skins():
+    """Rate and period are put in; below 200 frames the finest texture is named."""
     p = SkinProfile()
     texts = ["f{rate}\n", "p{period_ms}\n", "hex:9a 00 {period_ms}", "\x00\xff"]
     assert p.commands(texts, 250.0) == [b"f250\n", b"p4\n", b"\x9a\x00\x04", b"\x00\xff"]
     assert p.commands(["hex:{period_ms}"], 0.5) == [b"\xff"]
     assert p.commands(["hex:{period_ms}"], 5000) == [b"\x01"]
-
-
-def test_slow_skins_are_warned_of():
-    """Below 200 frames in a window, with the finest texture at 20 mm/s: 2 * 20 / 28 mm."""
     assert warning(SweepFormat(4, 4, 100, 200, "uint8")) == ""
     assert "56" in warning(SweepFormat(5, 1, 28, 56, "float32", 3))
     assert "1.5" in warning(SweepFormat(5, 1, 28, 56, "float32", 3))
-
-
-def test_settings_find_own_profiles(tmp_path, monkeypatch):
-    """`/etc/palpate/skins` has priority over the delivered profiles."""
-    monkeypatch.setattr(skins, "OWN", written(tmp_path, GOOD))
-    settings = config.load(None, ["skin.profile=own", "skin.grid=2x3"], site=NO_SITE)
-    assert settings.folder == ROOT / "firmware_config"
-    assert (skins.profile(settings).rows, skins.profile(settings).cols) == (2, 3)
 
 
 @given(

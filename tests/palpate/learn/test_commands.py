@@ -32,16 +32,12 @@ def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str
     return code, "".join(capsys.readouterr())
 
 
-def test_a_setting_forbids_it(options, capsys):
-    """With teach.allow = false nothing of it works; the message names the setting."""
+def test_settings_and_simulated_sweeps_are_refused(options, capsys):
+    """With teach.allow = false nothing works; --sim needs a folder of its own."""
     for more in (["--use"], ["--label", "cork", "--sim", "skin"], ["--forget", "cork"]):
         code, text = said([*options, "--set", "teach.allow=false", *more], capsys)
         assert code == 78
         assert "teach.allow" in text
-
-
-def test_simulated_sweeps_stay_out_of_a_box(capsys):
-    """--sim needs a folder of its own."""
     code, text = said(["--label", "cork", "--sim", "skin"], capsys)
     assert code == 78
     assert "--sim" in text

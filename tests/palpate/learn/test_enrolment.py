@@ -164,8 +164,8 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
     assert classes.displaced.means[:3].tolist() == arrays["displaced_means"].tolist()
 
 
-def test_early_answers_end_with_an_enrolment(tmp_path):
-    """The early heads do not have the label; the command says so."""
+def test_early_answers_end_and_close_materials_make_no_warning(tmp_path):
+    """The heads lack the label; no closer than two trained ones is accepted."""
     quick = toy_bundle.load(
         tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early")
     )
@@ -174,6 +174,12 @@ def test_early_answers_end_with_an_enrolment(tmp_path):
     assert len(new.warnings) == 1
     assert "answers" in new.warnings[0]
     Classifier(new.bundle, VirtualClock())
+    arrays = toy_bundle.means(
+        means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2])
+    )
+    made = toy_bundle.load(tmp_path / "x", arrays=arrays)
+    assert enrolment.enrol(made, "felt", counts((8.2, 0), (8.2, 0), (8.2, 0))).warnings == ()
+    assert len(enrolment.enrol(made, "felt", counts((7.8, 0), (7.8, 0), (7.8, 0))).warnings) == 1
 
 
 @pytest.mark.parametrize(
@@ -196,16 +202,6 @@ def test_unsuitable_sweeps_are_told_with_numbers(old, at, hints):
     assert all(hint in text for hint, text in zip(hints, found, strict=True))
     assert bool(new.disagreement) == any("close" not in hint for hint in hints)
     assert "felt" in new.bundle.manifest.labels
-
-
-def test_materials_that_lie_close_anyway_make_no_warning(tmp_path):
-    """No closer than two trained ones of the bundle."""
-    arrays = toy_bundle.means(
-        means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2])
-    )
-    made = toy_bundle.load(tmp_path / "x", arrays=arrays)
-    assert enrolment.enrol(made, "felt", counts((8.2, 0), (8.2, 0), (8.2, 0))).warnings == ()
-    assert len(enrolment.enrol(made, "felt", counts((7.8, 0), (7.8, 0), (7.8, 0))).warnings) == 1
 
 
 @pytest.mark.parametrize("label", ["b", "a,b", "", "x" * 25])

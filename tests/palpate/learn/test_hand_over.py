@@ -36,8 +36,8 @@ def test_the_file_comes_once_between_two_sweeps(tmp_path):
     assert not (tmp_path / FILE).exists()
 
 
-def test_a_file_that_cannot_be_written_ends_nothing(tmp_path, logged):
-    """It is said once."""
+def test_no_page_ends_nothing(tmp_path, logged, monkeypatch):
+    """A file that cannot be written is said once; without libraries nothing is handed over."""
     clock = VirtualClock()
     one = HandOver(tmp_path / "nowhere", clock)
     clock.sleep_until(clock.now_ns() + program.AFTER_NS)
@@ -45,6 +45,12 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path, logged):
         one.turn(HEALTH._replace(sweeping=False))
     assert len(logged) == 1
     assert "itself" in logged[0]
+    settings = load_settings(arguments("run", []))
+    with monkeypatch.context() as patched:
+        patched.setattr(process, "find_spec", lambda name: None)
+        assert "palpate_train" in teach_command.page_address(settings)
+    monkeypatch.setattr(teach_command, "find_spec", lambda name: None)
+    assert "palpate[page]" in teach_command.page_address(settings)
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link"])
@@ -97,13 +103,3 @@ def test_the_address_is_known_without_the_token(more, address):
     """The service may not read the token; why there is no page is said in its place."""
     settings = load_settings(arguments("run", more))
     assert re.fullmatch(address, teach_command.page_address(settings))
-
-
-def test_a_box_without_the_libraries_has_no_page(monkeypatch):
-    """It does not hand over to a program that could not run."""
-    settings = load_settings(arguments("run", []))
-    with monkeypatch.context() as patched:
-        patched.setattr(process, "find_spec", lambda name: None)
-        assert "palpate_train" in teach_command.page_address(settings)
-    monkeypatch.setattr(teach_command, "find_spec", lambda name: None)
-    assert "palpate[page]" in teach_command.page_address(settings)

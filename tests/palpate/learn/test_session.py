@@ -268,18 +268,14 @@ def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     narrower.recording.close()
 
 
-def test_each_material_begins_at_the_first_place(taught: Taught):
-    """Another place is of the present material; named again, it stays where it is."""
+def test_names_begin_at_the_first_place_and_fill_no_box(taught: Taught, monkeypatch):
+    """Another place is the present material's; so many names wait for a first sweep."""
     places = []
     for order in (("POSITION", "1"), ("TEACH", "cork"), ("NEXT", ""), ("TEACH", "pine")):
         taught.order("TEACH", "cork")
         taught.order(*order)
         places.append(taught.recording.about()["position"])
     assert places == ["1", "1", "2", "1"]
-
-
-def test_names_alone_fill_no_box(taught, monkeypatch):
-    """Only so many materials wait for their first sweep; one with sweeps does not count."""
     monkeypatch.setattr(session, "MOST_NAMED", 2)
     taught.sweeps("cork", 1)
     for name in ("felt", "pine", "felt"):
@@ -325,8 +321,13 @@ def test_use_does_not_overtake_what_the_disk_still_has_to_do(tmp_path):
     one.recording.close()
 
 
-def test_a_sweep_in_place_of_a_discarded_one_is_assessed(taught):
-    """Also if both happen in one turn, and there are as many sweeps as before."""
+def test_sweeps_are_assessed_again_after_a_discard(taught):
+    """Removed; also with another in its place in one turn."""
+    taught.sweeps("cork", 3)
+    taught.order("DISCARD", "3")
+    assert taught.session.materials() == {"cork": 2}
+    with pytest.raises(ApplianceError, match="2, not 3"):
+        taught.order("DISCARD", "3")
     taught.sweeps("cork", 2)
     taught.sweeps("pine", 2)
     taught.until(lambda about: not about["assessing"])
@@ -334,15 +335,6 @@ def test_a_sweep_in_place_of_a_discarded_one_is_assessed(taught):
     taught.sweeps("pine", 1)
     taught.session.turn(HEALTH)
     assert taught.session.about()["assessing"]
-
-
-def test_a_discarded_sweep_is_not_taught(taught):
-    """It is removed and the rest is assessed again."""
-    taught.sweeps("cork", 3)
-    taught.order("DISCARD", "3")
-    assert taught.session.materials() == {"cork": 2}
-    with pytest.raises(ApplianceError, match="2, not 3"):
-        taught.order("DISCARD", "3")
 
 
 def test_the_teacher_leads_from_material_to_material(taught):

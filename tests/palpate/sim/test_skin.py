@@ -37,16 +37,6 @@ def centre(frames: np.ndarray) -> np.ndarray:
 SHEAR = World(shear=True)
 
 
-def test_the_normal_axis_of_a_skin_with_shear_is_that_without():
-    """But for the noise of the readout."""
-    off = frozenset({"noise"})
-    plain, three = (
-        skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True)
-    )
-    assert (plain.dtype, three.dtype, three.shape) == (np.uint8, np.int16, (*plain.shape, 3))
-    np.testing.assert_array_equal(three[..., 2], plain)
-
-
 def test_friction_pulls_against_the_motion_while_the_finger_slides():
     """0.4 of the pressure; else 0."""
     frames = skin.sweep("metal", PLACE, rng(), replace(only("position"), shear=True)).astype(float)
@@ -60,8 +50,8 @@ def test_friction_pulls_against_the_motion_while_the_finger_slides():
     assert np.abs(centred[..., 1] - centred[..., 2] * y / 25).max() <= 1
 
 
-def test_sets_and_idle_skins_with_shear():
-    """Format, reproducibility; shear is noise around 0 without contact."""
+def test_shear_only_adds_axes():
+    """The normal axis but for the noise; sets repeat; 0 without contact."""
     samples, labels, _ = skin.sweep_set("T-HARD", 5, 1, SHEAR)
     assert (samples.shape, samples.dtype) == ((6, 1500, 4, 4, 3), np.int16)
     np.testing.assert_array_equal(labels, np.arange(6))
@@ -69,6 +59,12 @@ def test_sets_and_idle_skins_with_shear():
     assert idle.shape == (3000, 4, 4, 3)
     assert np.abs(idle.mean(0)).max() < 0.1
     assert SHEAR.format == replace(FORMAT, dtype="int16", axes=3)
+    off = frozenset({"noise"})
+    plain, three = (
+        skin.sweep("wood", PLACE, rng(), World(off=off, shear=shear)) for shear in (False, True)
+    )
+    assert (plain.dtype, three.dtype, three.shape) == (np.uint8, np.int16, (*plain.shape, 3))
+    np.testing.assert_array_equal(three[..., 2], plain)
 
 
 @pytest.mark.parametrize("material", MATERIALS)
@@ -83,7 +79,12 @@ def test_a_sweep_rests_slides_and_rests(material):
 
 
 def test_the_same_seed_gives_the_same_counts():
-    """A sweep, a window, an idle skin and a set repeat exactly; another seed differs."""
+    """Of sweep, window, idle skin, set; idle counts are 0 with 1 or 2 now and then."""
+    idle = skin.idle(3000, rng())
+    assert idle.shape == (3000, 4, 4)
+    assert idle.mean() < 1
+    assert 0 < idle.max() < 8
+    assert not skin.idle(10, rng(), STILL).any()
     for make in (
         lambda seed: skin.sweep("foam", PLACE, rng(seed)),
         lambda seed: skin.window("foam", PLACE, rng(seed)),
@@ -92,15 +93,6 @@ def test_the_same_seed_gives_the_same_counts():
     ):
         assert np.array_equal(make(1), make(1))
         assert not np.array_equal(make(1), make(2))
-
-
-def test_an_idle_skin_reads_zero_and_noise():
-    """Without contact counts are 0 with an occasional 1 or 2; without noise they are 0."""
-    idle = skin.idle(3000, rng())
-    assert idle.shape == (3000, 4, 4)
-    assert idle.mean() < 1
-    assert 0 < idle.max() < 8
-    assert not skin.idle(10, rng(), STILL).any()
 
 
 @pytest.mark.parametrize(
@@ -176,8 +168,8 @@ def test_further_forward_there_is_less_vibration_and_higher_relief():
     assert felt[1].std() > 1.2 * felt[0].std()
 
 
-def test_rows_see_the_texture_one_after_another():
-    """Row 3 shows it 100 frames earlier; columns differ."""
+def test_rows_see_the_texture_in_turn_under_a_steady_force():
+    """Row 3 100 frames earlier; for any error within a fifth."""
     frames = skin.window("plastic rough", Placement(), rng(), only("texture")).astype(float)
     frames -= frames.mean(0)
     lags = np.arange(-200, 201)
@@ -187,10 +179,6 @@ def test_rows_see_the_texture_one_after_another():
         assert lags[np.argmax(match)] == 100
         assert max(match) > 0.9
     assert abs(np.corrcoef(frames[:, 1, 1], frames[:, 1, 2])[0, 1]) < 0.6
-
-
-def test_force_keeps_within_a_fifth():
-    """For any error of the controller; slow, and other each time."""
     for world in (World(), World(force_spread=0.5)):
         force = np.array([skin.drift(1500, rng(seed), world) for seed in range(40)])
         assert force.min() >= 0.8
@@ -293,17 +281,13 @@ def test_positions_are_those_of_the_paper():
 
 
 def test_a_set_is_made_of_windows_at_its_positions():
-    """Without random effects each window depends only on its material and position."""
+    """By material and position alone; unknown names are refused."""
     world = only("position", "attachment")
     samples, labels, positions = skin.sweep_set("T-REAL", 5, 1, world)
     places = skin.placements("T-REAL", 5)
     for i in (0, 17, 53):
         expected = skin.window(MATERIALS[labels[i]], places[positions[i]], rng(), world)
         assert np.array_equal(samples[i], expected)
-
-
-def test_unknown_names_are_refused():
-    """A material, an effect and a set that do not exist are named in the error."""
     with pytest.raises(ConfigError, match="'glass'"):
         skin.window("glass", PLACE, rng())
     with pytest.raises(ConfigError, match="'gravity'"):

@@ -473,8 +473,8 @@ def test_a_later_run_writes_nothing_over(tmp_path):
     assert (about["run"], about["id"]) == (3, 1)
 
 
-def test_one_program_at_a_time_has_a_folder(tmp_path):
-    """A second program would use the same numbers, so it is refused, and the first continues."""
+def test_a_folder_has_one_program_and_is_on_the_disk(tmp_path, monkeypatch):
+    """Others are refused; it is synced into its parent at every start."""
     first = Desk(tmp_path)
     with pytest.raises(ConfigError, match="another"):
         Desk(tmp_path)
@@ -482,6 +482,12 @@ def test_one_program_at_a_time_has_a_folder(tmp_path):
     first.recording.close()
     Desk(tmp_path).sweep(1)
     assert names(tmp_path) == pairs(1, 2)
+    synced: list[Path] = []
+    monkeypatch.setattr(sweep_folder.storage, "sync", synced.append)
+    for _ in range(2):
+        SweepFolder(tmp_path / "a" / "b", toy_bundle.FORMAT).close()
+        assert {tmp_path, tmp_path / "a"} <= set(synced)
+        synced.clear()
 
 
 @pytest.mark.parametrize(
@@ -546,16 +552,6 @@ def test_a_folder_that_cannot_be_made(folder):
     """Reported before the robot sweeps."""
     with pytest.raises(ConfigError, match=f"--out {folder}: "):
         Desk(Path(folder))
-
-
-def test_folders_are_on_the_disk_before_their_sweeps(tmp_path, monkeypatch):
-    """Synced into their parents at every start."""
-    synced: list[Path] = []
-    monkeypatch.setattr(sweep_folder.storage, "sync", synced.append)
-    for _ in range(2):
-        SweepFolder(tmp_path / "a" / "b", toy_bundle.FORMAT).close()
-        assert {tmp_path, tmp_path / "a"} <= set(synced)
-        synced.clear()
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():

@@ -83,10 +83,17 @@ def test_a_faulty_skin_is_seen(rigged, frames, status, detail):
     assert detail in second.detail
 
 
-def test_a_sweep_that_is_too_short_keeps_its_status(rigged):
-    """Faults of the trigger and of the stream come first."""
+def test_short_sweeps_and_impossible_readings_are_no_good_sweeps(rigged):
+    """Faults of the trigger come first; dead-taxel before the skin is known, too."""
     box = recording(rigged, played(slide()[:RATE]))
     assert [v.status for v in box.until(lambda: box.box.answered == 1)] == [Status.SHORT]
+    format = SweepFormat(4, 4, 100.0, 50, "float32")
+    taxels = np.random.default_rng(0).normal(100, 3, (50, 4, 4)).astype(np.float32)
+    check = SweepCheck(format, rig.VirtualClock())
+    assert check(sweep_of(taxels)).status is Status.RECORDED
+    taxels[30, 2, 1] = 1e20
+    verdict = check(sweep_of(taxels))
+    assert (verdict.status, verdict.detail) == (Status.DEAD_TAXEL, "taxel 3.2")
 
 
 @pytest.mark.parametrize("tare", [False, True])
@@ -102,8 +109,8 @@ def test_contact_that_cannot_be_judged_is_said(rigged, tare):
     assert (box.box.circumstances()["unloaded"] is None) is not tare
 
 
-def test_commands_that_need_a_bundle(rigged):
-    """ID gives the skin's format; TEST has nothing to test."""
+def test_commands_that_need_a_bundle_and_another_skin(rigged):
+    """ID gives the format, TEST has nothing to test; a new skin is measured anew."""
     box = recording(rigged, played(slide()))
     box.seconds(0.5)
     said = box.ask("$PPLP,ID")
@@ -111,27 +118,12 @@ def test_commands_that_need_a_bundle(rigged):
     assert "TEST,error," in box.ask("$PPLP,TEST")
     with pytest.raises(ApplianceError, match="palpate"):
         SweepCheck(skin.FORMAT, rig.VirtualClock()).test()
-
-
-def test_another_skin_is_judged_by_itself():
-    """After a new enumeration the unloaded skin is measured anew."""
     check = SweepCheck(skin.FORMAT, rig.VirtualClock())
     stream(check, lifted(), slide())
     assert check.about()["unloaded"] is not None
     stream(check, slide(), epoch=1)
     assert check.about()["unloaded"] is None
     assert "checked" in check(sweep_of(slide()[:1500])).detail
-
-
-def test_an_impossible_reading_is_no_good_sweep():
-    """Before the unloaded skin is known, too: the answer is dead-taxel instead of recorded."""
-    format = SweepFormat(4, 4, 100.0, 50, "float32")
-    taxels = np.random.default_rng(0).normal(100, 3, (50, 4, 4)).astype(np.float32)
-    check = SweepCheck(format, rig.VirtualClock())
-    assert check(sweep_of(taxels)).status is Status.RECORDED
-    taxels[30, 2, 1] = 1e20
-    verdict = check(sweep_of(taxels))
-    assert (verdict.status, verdict.detail) == (Status.DEAD_TAXEL, "taxel 3.2")
 
 
 @pytest.mark.parametrize("level", [0, 77, 255])

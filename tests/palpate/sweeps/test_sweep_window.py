@@ -115,8 +115,8 @@ def test_each_trigger_is_answered_once(name):
     assert not bench.recorder.sweeping
 
 
-def test_middle_window():
-    """Frames 875 to 2374 of 500 to 2750; an odd number has one in its middle."""
+def test_the_middle_window_is_whole_on_every_axis():
+    """Frames 875 to 2374 of 500 to 2750; a missing one lies between its neighbours."""
     sweep = sweep_of(frames(0, 3000))
     assert (sweep.status, sweep.lost) == (Status.OK, 0)
     assert (sweep.frames.seq == np.arange(875, 2375)).all()
@@ -124,18 +124,6 @@ def test_middle_window():
     odd = SweepFormat(4, 4, 750.0, 101, "uint8")
     sweep = sweep_of(frames(0, 400, format=odd), 100, 300, odd)
     assert (len(sweep.frames), sweep.frames.seq[50]) == (101, 200)
-
-
-@given(start=st.integers(100, 1000), length=st.integers(1500, 1900), offset=st.floats(-0.45, 0.45))
-def test_window_lies_in_the_middle_to_the_frame(start, length, offset):
-    """For any sweep, the window's middle is the sweep's to one frame, whatever the edges' phase."""
-    sweep = sweep_of(frames(0, 3000), start + offset, start + length + offset)
-    middle = (sweep.frames.seq[0] + sweep.frames.seq[-1]) / 2
-    assert abs(middle - (start + length / 2)) <= 1
-
-
-def test_every_axis_is_interpolated():
-    """A missing frame of a skin with three axes lies between its neighbours on each of them."""
     format = SweepFormat(2, 2, 750.0, 100, "int16", 3)
     whole = frames(0, 400, format=format)
     slopes = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10])
@@ -144,6 +132,14 @@ def test_every_axis_is_interpolated():
     sweep = sweep_of(Frames(*kept), 100, 300, format)
     assert (sweep.status, sweep.lost) == (Status.OK, 2)
     np.testing.assert_array_equal(sweep.frames.taxels, whole.taxels[150:250])
+
+
+@given(start=st.integers(100, 1000), length=st.integers(1500, 1900), offset=st.floats(-0.45, 0.45))
+def test_window_lies_in_the_middle_to_the_frame(start, length, offset):
+    """For any sweep, the window's middle is the sweep's to one frame, whatever the edges' phase."""
+    sweep = sweep_of(frames(0, 3000), start + offset, start + length + offset)
+    middle = (sweep.frames.seq[0] + sweep.frames.seq[-1]) / 2
+    assert abs(middle - (start + length / 2)) <= 1
 
 
 @pytest.mark.parametrize(
@@ -272,8 +268,8 @@ def test_a_sweep_has_the_speed_and_force_of_its_start_edge():
     ]
 
 
-def test_steps_of_a_window_that_does_not_divide():
-    """Ten frames in three steps: 3, 5 and 8 of them, so that no head lacks a frame of its step."""
+def test_steps_divide_any_window_and_end_at_a_gap():
+    """Ten frames in three steps; three missing end them, two are interpolated."""
     format = SweepFormat(4, 4, 750.0, 10, "uint8")
     bench = Bench(format, lead_ms=0)
     bench.edge(START, 0)
@@ -281,10 +277,6 @@ def test_steps_of_a_window_that_does_not_divide():
     assert [len(s.frames) for s in bench.steps(3)] == [3, 5]
     bench.put(frames(7, 1, format=format))
     assert [len(s.frames) for s in bench.steps(3)] == [8]
-
-
-def test_no_step_lies_beyond_a_gap():
-    """Three end the steps, also later ones; two are interpolated."""
     bench = Bench(lead_ms=0)
     bench.edge(START, 0)
     bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))

@@ -28,7 +28,7 @@ def act(label: str, *, new_object: bool = False) -> Act:
 
 
 def test_only_ok_with_the_right_label_counts():
-    """Another label, or the right one unsure, is wrong; percentages have intervals."""
+    """Unsure is wrong; an object by its last answer; percentages have intervals."""
     score = AnswerScore(frozenset({"wood", "paper"}))
     right = [
         score.add(act("wood"), answer(1, "wood")),
@@ -42,10 +42,6 @@ def test_only_ok_with_the_right_label_counts():
     assert "[15.0, 85.0]" in table
     assert re.match(r"2\.00 s .*1 of 4", score.touch(750.0))
     assert score.latency().count("1.50 ms") == 2
-
-
-def test_an_object_counts_by_its_last_answer():
-    """Two sweeps of the first object, one of the second."""
     score = AnswerScore(frozenset({"wood", "paper"}))
     for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
         score.add(act("wood", new_object=new), answer(1, label))

@@ -213,13 +213,6 @@ def test_a_board_is_started_and_stopped():
     assert "another" in findings(simulated)["stop"].detail
 
 
-def test_no_reply_while_frames_are_sent_is_found():
-    """Over a serial port, where replies come between packets."""
-    simulated = idle_devices(acm=True)
-    of_requests(lambda b, n: b.running and n in (1, 2))(simulated)
-    assert "IDENTITY" in findings(simulated)["requests"].detail
-
-
 def test_what_cannot_be_decided_is_unknown():
     """Too short a time, jitter, a FIFO that does not run over."""
     found = findings(idle_devices(), seconds=0.02)
@@ -235,12 +228,15 @@ def test_what_cannot_be_decided_is_unknown():
     assert findings(simulated)["overflow"].verdict == "unknown"
 
 
-def test_a_cable_that_is_pulled_ends_the_check():
-    """With the link's error, not with a verdict on the board."""
+def test_a_pulled_cable_ends_the_check_and_no_reply_is_found():
+    """With the link's error; over a serial port, where replies come between packets."""
     simulated = idle_devices()
     simulated.backend.at(simulated.clock.now_ns() + 3_000_000_000, simulated.backend.unplug)
     with pytest.raises(SensorLost, match="unplugged"):
         findings(simulated)
+    simulated = idle_devices(acm=True)
+    of_requests(lambda b, n: b.running and n in (1, 2))(simulated)
+    assert "IDENTITY" in findings(simulated)["requests"].detail
 
 
 class EchoLink:

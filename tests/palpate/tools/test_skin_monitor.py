@@ -72,8 +72,8 @@ def test_faulty_taxels_are_named(taxels, dtype, kind, names):
     assert np.array(found["load"]).shape == (*axes, *taxels.shape[1:3])
 
 
-def test_rate_noise_and_load_are_measured():
-    """A slow touch is load and no noise."""
+def test_rate_noise_and_load_are_measured_from_the_second_frame_on():
+    """A slow touch is load; a new skin starts anew."""
     found = monitor(signal(4))
     assert found["rate_hz"] == pytest.approx(RATE, rel=1e-6)
     assert np.array(found["noise"]) == pytest.approx(np.full((1, 3, 4), 2.0), rel=0.25)
@@ -85,10 +85,6 @@ def test_rate_noise_and_load_are_measured():
     assert load[1, 2] > 380
     assert found["full"] == pytest.approx(load.max(), rel=0.01)
     assert np.array(found["noise"]).max() < 4
-
-
-def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew():
-    """Before the second frame nothing is measured and a new skin starts anew."""
     watched = SkinMonitor(SweepFormat(3, 4, RATE, 200, "float32"))
     assert watched.measured() == {}
     watched.take(frames(signal(1)))

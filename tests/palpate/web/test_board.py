@@ -52,7 +52,7 @@ def frames(board: PageBoard, at_s: float, row: float, col: float, strength: floa
 
 
 def test_the_first_lines_say_what_box_it_is(board, events):
-    """The page gets the box's presence, its labels and its state."""
+    """Presence, labels, state; names are the bundle's, labels where it has none."""
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
     told = feed_lines.health(1.0)
@@ -60,10 +60,6 @@ def test_the_first_lines_say_what_box_it_is(board, events):
     assert [shown[name] for name in ("trial", "ready", "lost_frames")] == [
         told[name] for name in ("trial", "ready", "lost_frames")
     ]
-
-
-def test_people_read_display_names(events):
-    """The labels stay; names beside them are those of the bundle, and labels where it has none."""
     board = PageBoard(events)
     board.take(feed_lines.hello(displays={"wood": "Holz, geölt", "gone": "weg"}))
     for number, label in enumerate(("wood", "metal"), 1):
@@ -138,8 +134,8 @@ def test_a_skin_that_goes_is_shown_at_once(board, events):
     assert events.of("view")[-1]["state"] == "wait"
 
 
-def test_loss_is_counted_by_the_minute(board, events):
-    """Frames and lost frames of each minute, not over a restart."""
+def test_loss_is_counted_by_the_minute_and_late_sweeps_are_kept(board, events):
+    """Not over a restart; sweeps by a number of their own."""
     for at_s in range(2, 125):
         board.take(feed_lines.health(float(at_s), lost_frames=3 if at_s > 70 else 0))
     assert [(one["frames"], one["lost"]) for one in events.of("minute")] == [
@@ -151,6 +147,13 @@ def test_loss_is_counted_by_the_minute(board, events):
     for at_s in range(200, 262):
         board.take(feed_lines.health(float(at_s), frames=750 * (at_s - 200), lost_frames=1, pid=72))
     assert (events.of("minute")[-1]["frames"], events.of("minute")[-1]["lost"]) == (45_000, 0)
+    for number in range(SWEEPS + 3):
+        board.take(feed_lines.sweep(number))
+    numbers = [one["number"] for one in events.of("signal")]
+    assert numbers == list(range(1, SWEEPS + 4))
+    assert board.sweep("3") is None
+    assert board.sweep("4")["sweep"] == 3
+    assert board.sweep(str(SWEEPS + 4)) is None
 
 
 def test_a_restart_is_noted_with_what_has_changed(board, events):
@@ -166,17 +169,6 @@ def test_a_restart_is_noted_with_what_has_changed(board, events):
     (note,) = events.of("note")
     assert note["time_ns"] == 9 * feed_lines.SECOND
     assert re.search("aaaa0001.* 9f3c2a1b", note["text"])
-
-
-def test_the_latest_sweeps_are_kept(board, events):
-    """By a number of their own, since the box counts anew after a restart."""
-    for number in range(SWEEPS + 3):
-        board.take(feed_lines.sweep(number))
-    numbers = [one["number"] for one in events.of("signal")]
-    assert numbers == list(range(1, SWEEPS + 4))
-    assert board.sweep("3") is None
-    assert board.sweep("4")["sweep"] == 3
-    assert board.sweep(str(SWEEPS + 4)) is None
 
 
 def test_lines_of_a_later_version_are_passed_over(board, events):

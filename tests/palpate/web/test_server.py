@@ -290,13 +290,6 @@ def test_a_browser_that_goes_is_forgotten(page, rudely):
     until(lambda: not page.watched)
 
 
-def test_it_listens_on_this_machine_alone(page):
-    """The socket is bound to 127.0.0.1; another address of this machine is refused."""
-    assert page.address.startswith("http://127.0.0.1:")
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
-
-
 def test_a_port_that_is_taken_is_named(page):
     """A ConfigError names the port and the remedy, also for an invalid port number."""
     for taken in (port(page), 70_000):
@@ -386,11 +379,14 @@ def test_wrong_tokens_are_slowed_and_logged_once(tmp_path, monkeypatch, logged):
     assert re.match("<4>page: .*127.0.0.1", line)
 
 
-def test_a_proxy_on_this_machine_may_pass_names_on():
-    """The names of watch.address are answered on the loopback address too, and no others."""
+def test_it_listens_on_this_machine_alone(page):
+    """On 127.0.0.1; the names of watch.address, and no others, are answered there."""
     access = Access.configured(WatchConfig(address="127.0.0.1 cell-7.plant.example"), 0)
     assert access.is_host("Cell-7.plant.example:443", "127.0.0.1")
     assert not access.is_host("evil.example", "127.0.0.1")
+    assert page.address.startswith("http://127.0.0.1:")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
 
 
 def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path, monkeypatch):

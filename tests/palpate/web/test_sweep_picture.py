@@ -14,7 +14,7 @@ from tests.factories import feed_lines
 
 
 def test_the_window_is_the_one_that_was_sent():
-    """Bytes, shape and type are equal, with several axes as well."""
+    """Bytes, shape, type, several axes; of a large skin MOST_TAXELS along the normal."""
     counts = np.arange(2 * 3 * 4 * 3, dtype="<i2").reshape(2, 3, 4, 3) - 7
     line = {
         "sweep": 5,
@@ -25,6 +25,15 @@ def test_the_window_is_the_one_that_was_sent():
     found = window(line, 100.0)
     assert (found.sweep, found.rate_hz) == (5, 100.0)
     np.testing.assert_array_equal(found.taxels, counts)
+    counts = np.zeros((100, 12, 32, 3), np.int16)
+    counts[:, 4:8, 10:14, 2] = 500
+    counts[:, 0, 0, 0] = 9000  # shear, which is not drawn
+    shown = picture(DrawnWindow(1, 100.0, counts))
+    assert len(shown["taxels"]) == MOST_TAXELS
+    assert shown["of"] == 384
+    assert [one["name"] for one in shown["taxels"]] == [
+        f"{r}.{c}" for r in range(5, 9) for c in range(11, 15)
+    ]
 
 
 def test_a_vibration_stands_at_its_frequency():
@@ -50,19 +59,6 @@ def test_no_peak_is_lost(frames):
         assert (min(one["low"]), max(one["high"])) == pytest.approx(
             (series.min(), series.max()), abs=0.01
         )
-
-
-def test_of_a_large_skin_the_most_loaded_taxels_are_drawn():
-    """MOST_TAXELS of them, along the normal, in their order on the skin."""
-    counts = np.zeros((100, 12, 32, 3), np.int16)
-    counts[:, 4:8, 10:14, 2] = 500
-    counts[:, 0, 0, 0] = 9000  # shear, which is not drawn
-    shown = picture(DrawnWindow(1, 100.0, counts))
-    assert len(shown["taxels"]) == MOST_TAXELS
-    assert shown["of"] == 384
-    assert [one["name"] for one in shown["taxels"]] == [
-        f"{r}.{c}" for r in range(5, 9) for c in range(11, 15)
-    ]
 
 
 def _nan() -> NDArray[np.float32]:

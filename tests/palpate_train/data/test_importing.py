@@ -412,10 +412,12 @@ def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: st
 
 def test_arrays_alone_say_all_or_are_named(tmp_path: Path):
     """A label that cannot be sent gets another; no array, no match, several ways."""
-    np.savez(tmp_path / "all.npz", **{"Filz weiß 1": COUNTS, "wool 2": COUNTS + 1})
+    whole = tmp_path / "whole.npz"
+    np.savez(whole, **{"Filz weiß 1": COUNTS, "wool 2": COUNTS + 1})
     made = taken(tmp_path, pattern=None, variable="{material} {trial:d}").sweeps
     assert made.materials == ("Filz weiss", "wool")
     assert made.displays == {"Filz weiss": "Filz weiß"}
+    whole.unlink()
     text(tmp_path / "a.csv")
     np.savez(tmp_path / "b.npz", felt=COUNTS, t=np.arange(40.0))
     np.savez(tmp_path / "c.npz", felt_a_b=COUNTS, felt_c=COUNTS, **{"wool_1": COUNTS[:3]})

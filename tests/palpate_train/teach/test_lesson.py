@@ -40,9 +40,9 @@ def test_a_missing_position_counts_and_no_sweep_is_an_error(tmp_path: Path):
     sweeps(tmp_path, "a", "b", first=3)
     lesson = Lesson.read(tmp_path)
     assert len(set(lesson.sweeps.groups["position"].tolist())) == 2
-    sweeps(tmp_path, "", "")
+    sweeps(tmp_path / "bare", "", "")
     with pytest.raises(FormatError, match=r"2 no material"):
-        Lesson.read(tmp_path)
+        Lesson.read(tmp_path / "bare")
     with pytest.raises(FormatError, match="be read"):
         Lesson.read(tmp_path / "nowhere")
 

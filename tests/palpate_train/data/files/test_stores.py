@@ -66,7 +66,7 @@ def test_a_store_of_several_arrays_counts_as_a_file(tmp_path: Path):
     (tmp_path / "a.csv").write_text("1")
     buffer(tmp_path / "in" / "b.zarr")
     names = [path.relative_to(tmp_path).as_posix() for path in readers.files_below(tmp_path)]
-    assert names == ["a.csv", "in/b.zarr"]
+    assert names == ["a.csv", "a.zarr", "in/b.zarr"]
 
 
 def messages(path: Path, end: bool = True) -> Path:
