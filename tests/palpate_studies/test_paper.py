@@ -115,6 +115,7 @@ def test_summary_pools_seeds_and_keeps_each_result(results: dict[str, Any]):
     assert np.sum(results["confusion"]["H-svm"], 1).tolist() == [24] * 6
 
 
+@pytest.mark.slow
 def test_the_page_is_one_file_with_ours_and_the_printed_values(results: dict[str, Any]):
     """Its tags close, it needs no other file, and it has each row with its interval."""
     page, pictures = paper_report.render(results)

@@ -51,6 +51,7 @@ def test_every_table_is_written_once_and_the_text_around_it_stays(
     assert "var(" not in first[tables.FRONT]
 
 
+@pytest.mark.slow
 def test_a_changed_figure_changes_its_document_alone(
     project: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -485,8 +485,18 @@ def test_help_and_status_load_little(words):
     assert python(code) == "set()"
 
 
-def test_settings_have_their_sources_and_status_reads_them(tmp_path, monkeypatch, capsys):
-    """Each with its file; store.runtime is read, and a missing file is not needed."""
+def test_settings_have_their_sources(capsys):
+    """Each value with the file it comes from."""
+    sets = with_sets("sweep.max_duration_s=9")
+    assert main(["check", "--settings", "--board", "rpi5", *sets]) == 0
+    out = capsys.readouterr().out
+    (line,) = [line for line in out.splitlines() if line.startswith("sweep.max_duration_s")]
+    assert line.endswith("# --set")
+    assert "board-rpi5.toml" in out
+
+
+def test_status_finds_another_runtime_folder(tmp_path, monkeypatch, capsys):
+    """A settings file that names store.runtime is read, and a missing one is not needed."""
     monkeypatch.setattr(runtime_folder, "CHECKOUT", str(tmp_path))
     (tmp_path / "skin.toml").write_text("skin.rate_hz = 100.0\n")
     assert main(["status"]) == 1
@@ -494,12 +504,6 @@ def test_settings_have_their_sources_and_status_reads_them(tmp_path, monkeypatch
     (tmp_path / "skin.toml").write_text(f'store.runtime = "{tmp_path}"\n')
     assert main(["status"]) == 1
     assert str(tmp_path) in capsys.readouterr().out
-    sets = with_sets("sweep.max_duration_s=9")
-    assert main(["check", "--settings", "--board", "rpi5", *sets]) == 0
-    out = capsys.readouterr().out
-    (line,) = [line for line in out.splitlines() if line.startswith("sweep.max_duration_s")]
-    assert line.endswith("# --set")
-    assert "board-rpi5.toml" in out
 
 
 def test_each_command_has_a_function_and_unknown_ones_an_error():

@@ -195,7 +195,10 @@ ERRORS = (
 )
 
 
-@pytest.mark.parametrize("number", range(2 * len(CALLS)))
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n >= len(CALLS))) for n in range(2 * len(CALLS))],
+)
 def test_no_error_of_a_usb_call_leaves_read(monkeypatch, number):
     """Whatever libusb raises is a state with its reason, until the error is over."""
     reading = SensorReading()

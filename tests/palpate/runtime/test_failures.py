@@ -54,13 +54,13 @@ def fail(box: Rigged, on: Callable[[int], bool], error: Exception = BAD_ALLOC) -
 @pytest.mark.parametrize("error", [BAD_ALLOC, MemoryError(), ModelError("Gather: index 7")])
 def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
     """Its status is `failed`, its detail the reason, and the sweeps after it are answered."""
-    simulated = tubes(1, 3)
+    simulated = tubes(1, 2)
     box = rigged(simulated)
-    fail(box, {2}.__contains__, error)
+    fail(box, {1}.__contains__, error)
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
     assert [v.status for v in verdicts].count(Status.FAILED) == 1
-    assert heard(box)[1] == (2, "failed")
-    assert (verdicts[1].detail, verdicts[1].label) == (str(error) or "MemoryError", "")
+    assert heard(box)[0] == (1, "failed")
+    assert (verdicts[0].detail, verdicts[0].label) == (str(error) or "MemoryError", "")
 
 
 def test_repeated_failures_end_the_program_once_all_are_answered(rigged):

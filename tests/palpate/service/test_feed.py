@@ -142,16 +142,8 @@ def test_of_a_large_skin_fewer_frames_are_offered(offers):
     assert found == pytest.approx(97.65625, abs=1)
 
 
-def test_verdicts_have_all_probabilities_and_frames_null_for_no_number(offers, offered):
-    """Valid JSON; absent speed and force are left out."""
-    format = SweepFormat(1, 3, 100.0, 200, "float32", 3)
-    offered = offers(format)
-    peer = asking(offered, '{"frames": 20}')
-    one = frames(1, format)
-    one.taxels[0, 0, 1] = (np.nan, np.inf, 0.5)
-    offered.feed.frames(one)
-    offered.turns(5)
-    assert of(peer.lines(), "frame")[0]["taxels"][0][1] == [None, None, 0.5]
+def test_a_verdict_has_the_probabilities_of_all_labels(offered):
+    """And the shift; absent speed and force are left out."""
     peer = asking(offered)
     for one in (OK, replace(OK, force_n=1.5)):
         offered.feed.answered(one)
@@ -161,6 +153,18 @@ def test_verdicts_have_all_probabilities_and_frames_null_for_no_number(offers, o
     assert (first["scores"], first["moved"]) == ([0.987, 0.013], "moved 2 mm")
     assert not first.keys() & {"speed_mm_s", "force_n"}
     assert (second["force_n"], "speed_mm_s" in second) == (1.5, False)
+
+
+def test_counts_that_are_no_numbers_become_null(offers):
+    """A float skin with a broken taxel: the line is valid JSON."""
+    format = SweepFormat(1, 3, 100.0, 200, "float32", 3)
+    offered = offers(format)
+    peer = asking(offered, '{"frames": 20}')
+    one = frames(1, format)
+    one.taxels[0, 0, 1] = (np.nan, np.inf, 0.5)
+    offered.feed.frames(one)
+    offered.turns(5)
+    assert of(peer.lines(), "frame")[0]["taxels"][0][1] == [None, None, 0.5]
 
 
 def test_a_verdict_is_not_kept_for_the_next_look(offered):
@@ -493,8 +497,8 @@ def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered):
     assert peer.ended
 
 
-def test_lines_are_made_for_readers_and_once(offered, monkeypatch):
-    """None without readers; after a suspend of a day one health and one frame."""
+def test_without_readers_nothing_is_written_as_text(offered, monkeypatch):
+    """No verdict, no frame, no health is encoded; only changes of the state are."""
     made: list[str] = []
     monkeypatch.setattr(module, "encode", lambda kind, content: made.append(kind) or b"")
     for _ in range(500):
@@ -503,6 +507,10 @@ def test_lines_are_made_for_readers_and_once(offered, monkeypatch):
         offered.feed.sweep(cut(), OK, {})
         offered.turns()
     assert set(made) <= {"state"}
+
+
+def test_a_clock_that_jumps_ahead_gives_one_line(offered):
+    """After a suspend of a day: one health and one frame, and no frame is repeated."""
     peer = asking(offered, '{"frames": 20}')
     offered.feed.frames(frames())
     offered.clock.sleep_until(offered.clock.now_ns() + 86_400 * SECOND)

@@ -74,8 +74,8 @@ def test_the_last_sweeps_are_kept_over_restarts(tmp_path):
     assert numbers(folder) == [7]
 
 
-def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch, logged):
-    """After the newest has its name; another error of the disk removes none."""
+def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch):
+    """A sweep is removed after the newest has its name."""
     black = box(tmp_path)
     put(black, 1, 2, 3)
     there: list[int] = []
@@ -88,6 +88,10 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch, logged):
     monkeypatch.setattr(Path, "unlink", noted)
     put(black, 4)
     assert there == [4, 3]
+
+
+def test_another_error_removes_no_sweep(tmp_path, monkeypatch, logged):
+    """If the disk fails although it is not full, existing sweeps are kept."""
     black = box(tmp_path)
     put(black, 1)
     failing(monkeypatch, errno.EIO, lambda: True)

@@ -52,7 +52,7 @@ def frames(board: PageBoard, at_s: float, row: float, col: float, strength: floa
 
 
 def test_the_first_lines_say_what_box_it_is(board, events):
-    """Presence, labels, state; names are the bundle's, labels where it has none."""
+    """The page gets the box's presence, its labels and its state."""
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
     told = feed_lines.health(1.0)
@@ -60,6 +60,10 @@ def test_the_first_lines_say_what_box_it_is(board, events):
     assert [shown[name] for name in ("trial", "ready", "lost_frames")] == [
         told[name] for name in ("trial", "ready", "lost_frames")
     ]
+
+
+def test_people_read_display_names(events):
+    """The labels stay; names beside them are those of the bundle, and labels where it has none."""
     board = PageBoard(events)
     board.take(feed_lines.hello(displays={"wood": "Holz, geölt", "gone": "weg"}))
     for number, label in enumerate(("wood", "metal"), 1):
