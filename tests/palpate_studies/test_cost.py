@@ -13,7 +13,7 @@ from tests.factories.loud_model import loudness, sweeps
 
 
 def test_weights_products_and_transforms_are_counted():
-    """By hand; int8 the same, scales are no weights; L and H have their transforms."""
+    """By hand; int8 the same, without scales; L and H have their transforms."""
     plain, whole = loudness(), quantize(loudness(), sweeps().samples)
     assert cost.precision(plain) == "float"
     assert cost.precision(whole) == "int8"

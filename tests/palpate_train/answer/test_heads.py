@@ -89,7 +89,7 @@ def test_a_feature_that_moves_with_a_condition_counts_less():
 
 
 def test_recordings_are_no_condition_and_a_material_without_sweeps_is_never_named():
-    """Only what a user may vary is one; the missing logit lies below all others."""
+    """Conditions are those that a user may vary; the missing logit lies below all others."""
     groups = {"recording": np.arange(4), "force": np.array([5, 7, 5, 9])}
     assert heads.condition_values(groups, 4).tolist() == [[0], [1], [0], [2]]
     assert heads.condition_values({"recording": np.arange(4)}, 4).shape == (4, 0)

@@ -110,7 +110,7 @@ def test_no_known_sweep_is_refused(sweeps: dict[str, float]):
 
 
 def test_distances_of_zero_and_the_nearest_other_mean():
-    """One sweep or sweeps at their mean are finite; the own mean is no other."""
+    """One sweep or sweeps at their mean are finite; the own mean does not count."""
     one = np.zeros(1)
     found = limits({"force": LeftOut(one, one, one, one, one.astype(int), one.astype(int), 2)})
     assert 0 < found.strict <= found.loose < np.inf

@@ -265,7 +265,7 @@ TABLE = (
 
 
 def test_labels_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """By path or name; what it lacks is left out, a missing file is a fault."""
+    """By path or name; files without a label are left out, a missing file is a fault."""
     for name in ("a/1", "b/2", "b/3", "b/4"):
         counts = np.random.default_rng(int(name[-1])).integers(0, 99, (30, 4))
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -229,7 +229,7 @@ def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
 def test_the_same_fit_gives_the_same_bytes(
     fitted: Fit, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Also from the file of the fit, which keeps what was found."""
+    """Also from the file of the fit, which keeps calibration and contacts."""
     fitted.save(tmp_path / "fit.npz")
     monkeypatch.setattr(quantized_bundle, "finished", None)
     for made in (fitted, Fit.load(tmp_path / "fit.npz")):

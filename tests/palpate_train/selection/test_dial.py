@@ -80,7 +80,7 @@ def missing(numbers: slice) -> np.ndarray:
 
 
 def test_the_smallest_that_suffices_is_taken():
-    """A gain at one place is no reason; cost is the order; without .85 one standard error."""
+    """A gain at one place does not count; cost is the order; without .85 one standard error."""
     for small, chosen in ((missing(slice(12)), "bands"), (missing(slice(0, None, 8)), "all")):
         judged = judgement(bands=small, all=EVERYTHING)
         assert judged.choose(["bands", "all"], 0.0, EVERYTHING) == chosen

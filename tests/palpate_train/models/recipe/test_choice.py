@@ -130,7 +130,7 @@ def test_what_is_clearly_better_is_chosen():
 
 
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
-    """All magnitudes and all features, without copies; loss alone is no reason."""
+    """All magnitudes and all features, without copies; loss alone does not count."""
     at = scores()
     chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE), print)
     assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
