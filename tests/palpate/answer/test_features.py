@@ -28,9 +28,8 @@ def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) ->
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-def test_weights_are_equation_4():
-    """Each weight is the taxel's sum of counts over the sum of all counts, row by row. A negative
-    taxel is left out; without activation, or with a negative one, all weights are 1 / M."""
+def test_weights_and_h_features_are_equations_4_and_5():
+    """Sums over sums, 1 / M without activation; all 760 H-features by the paper's sum."""
     x = _sweep()
     sums = x.sum(axis=0, dtype=float).ravel()
     np.testing.assert_allclose(features.taxel_weights(x), sums / sums.sum(), rtol=1e-12)
@@ -39,6 +38,11 @@ def test_weights_are_equation_4():
     for level in (0, -7):
         none = features.taxel_weights(np.full((5, 2, 2), level, np.int16))
         np.testing.assert_array_equal(none, [0.25] * 4)
+    x = _sweep()
+    assert features.h_shape(FRAMES, RATE) == (40, 19)
+    np.testing.assert_allclose(
+        features.h_features(x, RATE).reshape(40, 19), _h_by_the_formula(x), atol=1e-12
+    )
 
 
 def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel():
@@ -97,15 +101,6 @@ def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
     return p / p.sum(axis=1, keepdims=True)
 
 
-def test_h_features_are_equation_5():
-    """All 760 numbers equal the paper's sum: mean subtracted, two bins in a band."""
-    x = _sweep()
-    assert features.h_shape(FRAMES, RATE) == (40, 19)
-    np.testing.assert_allclose(
-        features.h_features(x, RATE).reshape(40, 19), _h_by_the_formula(x), atol=1e-12
-    )
-
-
 @pytest.mark.parametrize(("window", "scipys"), [("rect", "boxcar"), ("hann", "hann")])
 def test_h_features_agree_with_a_spectrogram(window, scipys):
     """Where steps are whole frames all windows equal scipy's, but the cut-off one."""
@@ -131,14 +126,20 @@ def test_a_silent_or_saturated_skin_has_finite_features(level):
     assert not features.h_features(x, RATE).any()
 
 
-def test_few_frames_give_l_features():
-    """A band without a bin keeps the bin above its lower edge; one frame has no H-features."""
+def test_few_frames_give_l_features_and_odd_ones_are_refused():
+    """A band keeps the bin above its edge; NaN and an unknown window function are refused."""
     x = _sweep(10)
     assert features.l_features(x, RATE)[2] == pytest.approx(75)
     assert features.l_features(x, 30.0)[1] == pytest.approx(15)
     assert np.isfinite(features.l_features(x[:1], RATE)).all()
     with pytest.raises(FormatError, match=r"1 .* 75"):
         features.h_features(x[:1], RATE)
+    x = np.ones((80, 2, 2), np.float32)
+    with pytest.raises(FormatError, match="'hamming'"):
+        features.h_features(x, RATE, "hamming")
+    x[3, 1, 1] = math.nan
+    with pytest.raises(FormatError, match="number"):
+        features.taxel_weights(x)
 
 
 @settings(max_examples=60)
@@ -188,13 +189,3 @@ def test_what_cannot_be_computed_is_named(kind, shape, rate_hz, message):
     """Each refusal is a FormatError with the value that was wrong."""
     with pytest.raises(FormatError, match=message):
         features.compute(kind, np.ones(shape, np.uint8), rate_hz)
-
-
-def test_counts_that_are_no_numbers_and_unknown_windows_are_refused():
-    """NaN among float32 counts, and an unknown window function."""
-    x = np.ones((80, 2, 2), np.float32)
-    with pytest.raises(FormatError, match="'hamming'"):
-        features.h_features(x, RATE, "hamming")
-    x[3, 1, 1] = math.nan
-    with pytest.raises(FormatError, match="number"):
-        features.taxel_weights(x)

@@ -83,8 +83,8 @@ def test_a_sweep_that_is_answered_can_be_taught(model):
     assert weak
 
 
-def test_only_one_loaded_taxel_is_named():
-    """With a known contact threshold the taxel is named; a skin of two taxels is not judged."""
+def test_one_loaded_taxel_is_named_and_a_skin_without_patterns_not_judged():
+    """Nor is a skin of two taxels, whose slides look like rests."""
     format = SweepFormat(4, 4, 100, 200, "uint8")
     counts = np.zeros((200, 4, 4), np.uint8)
     counts[:, 1, 2] = 50 + np.arange(200) % 7
@@ -92,6 +92,11 @@ def test_only_one_loaded_taxel_is_named():
     assert "contact" in SlideCheck(format, np.zeros((4, 4)), 90.0)(counts)
     small = SweepFormat(1, 2, 100, 200, "uint8")
     assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) is None
+    rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
+    assert SlidesAmong(skin.FORMAT).among(rests) == [None] * 6
+    tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
+    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [None] * MANY
+    assert tiny(np.zeros((200, 1, 2), np.uint8)) is None
 
 
 def slides(count: int) -> list[np.ndarray]:
@@ -113,12 +118,3 @@ def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind):
     first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)])
     assert first[0].startswith("no slide")
     assert first[1:] == [None] * MANY
-
-
-def test_a_skin_without_patterns_is_not_judged_by_them():
-    """Its slides look like rests, so all are accepted; nor is a skin of two taxels judged."""
-    rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
-    assert SlidesAmong(skin.FORMAT).among(rests) == [None] * 6
-    tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
-    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [None] * MANY
-    assert tiny(np.zeros((200, 1, 2), np.uint8)) is None

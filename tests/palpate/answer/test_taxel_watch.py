@@ -139,30 +139,32 @@ def test_a_bundle_without_the_figure_bridges_nothing(tmp_path, taxels, status):
     assert (verdict.status, verdict.degraded, bare.degraded) == (status, "", "")
 
 
-def test_a_bridged_window_without_contact_is_refused(run):
-    """A single stuck taxel does not count as contact."""
+def test_windows_without_contact_or_with_too_many_broken_taxels_are_refused(run):
+    """A stuck taxel is no contact; also where they are sound now; sidecars of sound skins."""
     taxels = np.where(np.arange(100) % 2, 5, 0)[:, None, None] * np.ones((4, 4))
     taxels[:, 2, 2] = 90
     assert run(sweep_of(taxels.astype(np.int16))).status is Status.NO_CONTACT
+    assert "broken" not in run.about()
+    for _ in range(CERTAIN):
+        run.frames(frames_of(broken(FOUR)))
+    assert run.degraded == "silent taxel 2.2 2.3 3.2 3.3"
+    assert run(sweep_of(GOOD)).status is Status.STUCK_TAXEL
+    assert run.about()["broken"][0][1] == [False, True, True, False]
 
 
-def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path):
-    """A dead taxel at the edge would move the centre of the contact."""
-    at = replace(toy_bundle.IN_PLACE, rows_mm=(1.5,), cols_mm=(1.5,), limit_mm=0.05)
-    dead = broken(np.s_[:, 3, 3])
-    assert Classifier(made(tmp_path, contact=at), VirtualClock())(sweep_of(dead)).displacement == ""
-    dead[::2, 3, 3] = 1  # neither constant nor loaded
-    assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep_of(dead)).displacement
-
-
-def test_an_early_answer_bridges_too(tmp_path):
-    """The answer has the taxel; with too many broken taxels the rest of the sweep is needed."""
+def test_early_answers_and_places_of_contact_are_of_bridged_taxels(tmp_path):
+    """With too many broken taxels the rest is needed; a dead edge would move the centre."""
     outputs, rule = ("logits", "embedding", "early"), Early((0.5,) * 3, 1)
     early = EarlyExit(Classifier(made(tmp_path, early=rule, outputs=outputs), VirtualClock()))
     verdict = early(sweep_of(BAD[:75], share=0.75))
     assert verdict
     assert (verdict.status, verdict.degraded) == (Status.OK, "silent taxel 2.2")
     assert early(sweep_of(broken(FOUR)[:75], share=0.75)) is None
+    at = replace(toy_bundle.IN_PLACE, rows_mm=(1.5,), cols_mm=(1.5,), limit_mm=0.05)
+    dead = broken(np.s_[:, 3, 3])
+    assert Classifier(made(tmp_path, contact=at), VirtualClock())(sweep_of(dead)).displacement == ""
+    dead[::2, 3, 3] = 1  # neither constant nor loaded
+    assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep_of(dead)).displacement
 
 
 @pytest.mark.parametrize("kind", ["silent", "noisy"])
@@ -197,13 +199,3 @@ def test_a_resting_skin_does_not_clear_a_silent_taxel(watch):
     """A constant skin says nothing about silent taxels."""
     assert seen(watch, BAD, times=CERTAIN)
     assert seen(watch, np.full((100, 4, 4), 50, np.int16), times=2 * SOUND) == "silent taxel 2.2"
-
-
-def test_too_many_taxels_over_the_stream_are_refused(run):
-    """Also in a window in which they are sound; sidecars of sound skins are free."""
-    assert "broken" not in run.about()
-    for _ in range(CERTAIN):
-        run.frames(frames_of(broken(FOUR)))
-    assert run.degraded == "silent taxel 2.2 2.3 3.2 3.3"
-    assert run(sweep_of(GOOD)).status is Status.STUCK_TAXEL
-    assert run.about()["broken"][0][1] == [False, True, True, False]

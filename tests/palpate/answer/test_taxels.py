@@ -119,8 +119,8 @@ def test_a_skin_whose_sound_taxels_may_be_constant():
     )
 
 
-def test_a_taxel_is_compared_with_the_lower_median_around_it():
-    """Up to REACH taxels away; constant ones are left out, and without others there is none."""
+def test_noise_of_triples_is_compared_with_the_median_around():
+    """sqrt(6 * 2 / pi), none of a ramp; up to REACH taxels away without constant ones."""
     noise = np.random.default_rng(2).standard_normal((FRAMES, 1, 7)) * np.arange(1, 8)
     noise[:, 0, 6] = 5
     measured = Window(noise.astype(np.float32))
@@ -129,10 +129,6 @@ def test_a_taxel_is_compared_with_the_lower_median_around_it():
         near = [*range(max(0, k - REACH), k), *range(k + 1, min(6, k + REACH + 1))]
         assert around[k] == sorted(measured.noise[near])[(len(near) - 1) // 2]
     assert np.isinf(Comparison.of(Window(np.ones((FRAMES, 1, 2), np.float32)), (1, 2)).around).all()
-
-
-def test_noise_is_measured_at_triples_of_frames():
-    """White noise gives sqrt(6 * 2 / pi); a ramp none; two frames none."""
     rng = np.random.default_rng(0)
     white = rng.standard_normal((30 * TRIPLES, 1, 1)).astype(np.float32)
     assert Window(white).noise[0] == pytest.approx(np.sqrt(12 / np.pi), rel=0.2)

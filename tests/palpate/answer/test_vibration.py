@@ -18,8 +18,8 @@ def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
     return (TARE + load + swing[:, None, None]).astype(np.float32)
 
 
-def test_it_is_the_deviation_over_the_load_along_the_normal():
-    """Whatever gain and shear; a quarter of a count on a million is measured, too."""
+def test_it_is_the_deviation_over_the_load_and_a_constant_part_rests():
+    """Whatever gain and shear; counts that are not numbers are refused elsewhere."""
     want = [math.log(1 / 50), math.log(4 / 50)]
     assert vibration(window(1, 4), TARE, 2) == pytest.approx(want, abs=1e-3)
     strong = TARE + 10 * (window(1, 4) - TARE)
@@ -29,10 +29,6 @@ def test_it_is_the_deviation_over_the_load_along_the_normal():
     axes = np.stack([100 * window(5, 5), window(1, 4)], axis=-1)
     tare = np.stack([TARE, TARE], axis=-1)
     assert vibration(axes, tare, 2) == pytest.approx(vibration(window(1, 4), TARE, 2))
-
-
-def test_a_constant_part_rests_and_numbers_that_are_none_do_not():
-    """Without warnings; counts that are not numbers are refused elsewhere."""
     limits = SlideLimits((-5.0, -1.0))
     assert limits.resting(vibration(window(0, 4, 0), TARE, 3), 0) == [1, 3]
     assert limits.resting(vibration(window(4, 4, 4), TARE, 3), 0) == []

@@ -69,13 +69,19 @@ def test_a_serial_line_that_is_not_there_gets_a_warning(caplog):
     assert not caplog.text
 
 
-def test_the_settings_of_a_new_box():
-    """Modbus reads the feed on this machine, without commands; TCP lacks a serial line."""
+def test_settings_of_a_new_box_and_options():
+    """Modbus reads the feed here, without commands; options are not changed by settings."""
     args = settled("modbus")
     assert (args.feed, args.listen) == ("/run/palpate/feed.sock", "127.0.0.1:1502")
     assert (args.link, args.allow_writes) == (None, False)
     with pytest.raises(ConfigError, match="/run/palpate-tcp/line"):
         settled("tcp")
+    sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
+    options = ("--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes")
+    args = settled("tcp", *options, sets=sets)
+    assert (args.port, args.listen) == ("/dev/ttyUSB0", "[::1]:7")
+    assert (args.link, args.allow_writes) == (None, True)
+    assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
 
 
 @pytest.mark.parametrize("kind", LINKS)
@@ -86,16 +92,6 @@ def test_the_line_of_the_bridge(kind):
     assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)
     if kind in PORTS:
         assert args.listen == f"192.168.0.10:{PORTS[kind]}"
-
-
-def test_options_hold():
-    """A line, an address, or a feed by option: the settings do not change them."""
-    sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
-    options = ("--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes")
-    args = settled("tcp", *options, sets=sets)
-    assert (args.port, args.listen) == ("/dev/ttyUSB0", "[::1]:7")
-    assert (args.link, args.allow_writes) == (None, True)
-    assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
 
 
 @pytest.mark.parametrize(

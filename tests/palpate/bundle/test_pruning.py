@@ -69,7 +69,7 @@ def test_a_pruned_model_passes_the_check_and_a_plain_one_stays(default_bundle):
 
 
 def test_declarations_of_what_is_gone_are_gone():
-    """Only the values of remaining nodes stay declared."""
+    """Values of remaining nodes stay; a missing output and other bytes are refused."""
     onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
     inferred = onnx.shape_inference.infer_shapes(
         onnx.load_from_string(toy_bundle.model(ALL))
@@ -78,10 +78,6 @@ def test_declarations_of_what_is_gone_are_gone():
     pruned = prune(inferred, {"embedding"})
     assert set(names(pruned, "value_info")) == {"float", "mean", "taxels"}
     onnx.checker.check_model(onnx.load_from_string(pruned), full_check=True)
-
-
-def test_an_output_that_is_not_there_is_refused():
-    """With the model's outputs; bytes that are not a model are refused, too."""
     with pytest.raises(BundleError, match="early"):
         prune(toy_bundle.model(), {"logits", "early"})
     with pytest.raises(BundleError, match=r"\['logits'\]"):

@@ -69,14 +69,19 @@ def test_a_signed_bundle_may_be_named(box, capsys):
         assert f", {said}" in lines[0]
 
 
-def test_what_answers_no_robot_takes_any_bundle(box, capsys):
-    """With simulated devices, whose sentences say so."""
+def test_simulations_and_benches_take_any_bundle(box, capsys):
+    """Sentences say so; with the setting after a warning, here without a trigger line."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     sim = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
     main(["check", *of(box), *sim])
     output = capsys.readouterr()
     assert "bundle" in output.out
     assert "signed" not in output.out
+    folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
+    assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
+    warning, *_, end = capsys.readouterr().err.splitlines()
+    assert SAID in warning
+    assert "trigger.start" in end
 
 
 def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypatch, capsys):
@@ -90,12 +95,3 @@ def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypat
         assert bool(json.loads((box.folder / "status.json").read_text())["unsigned"]) == said
         main(["check", *VIRTUAL[:3], *of(box), *options])
         assert (f"ok    signatures     warning: {SAID}" in capsys.readouterr().out) == said
-
-
-def test_a_bench_may_allow_unsigned_bundles(box, capsys):
-    """After a warning; here the start fails, since no trigger line is wired."""
-    folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
-    assert main(["run", *of(box), *ALLOWED, "--set", f"classifier.bundle={folder}"]) == 78
-    warning, *_, end = capsys.readouterr().err.splitlines()
-    assert SAID in warning
-    assert "trigger.start" in end

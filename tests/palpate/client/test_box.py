@@ -286,16 +286,12 @@ def test_old_answers_are_dropped(speaking, box):
             box.result(SHORT_S)
 
 
-def test_more_than_a_pseudo_terminal_holds_arrives_whole(speaking, box):
-    """A read gives 4,095 bytes at most: sentences are cut anywhere."""
+def test_sentences_arrive_whole_and_threads_do_not_mix(speaking, box):
+    """A read gives 4,095 bytes at most; two threads that ask get their own answers."""
     told = state() * (40_000 // len(state()))
     speaking.say(result(1), told, result(2), told, result(3))
     assert [box.result(LONG_S).sweep for _ in range(3)] == [1, 2, 3]
     assert (box.damaged, box.missed) == (0, 0)
-
-
-def test_commands_of_several_threads_do_not_mix(speaking, box):
-    """Two threads that ask get each its own answers."""
     names: list[str] = []
     threads = [waiting(lambda: names.append(box.identify().name))[0] for _ in range(8)]
     states = [box.state().skin for _ in range(8)]

@@ -51,17 +51,13 @@ def test_no_command_writes_another_kind_of_file(run, words, name, tmp_path, caps
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_folder_may_have_a_point_in_its_name(tmp_path):
-    """As in the version of a bundle; and a folder that is there keeps the name that it has."""
+def test_a_file_has_its_ending_and_a_folder_any(tmp_path):
+    """All allowed ones are named; a folder keeps its name, with a point as in a version."""
     assert outputs.folder("bundle-1.2") == Path("bundle-1.2")
     (tmp_path / "old.csv").mkdir()
     assert outputs.folder(str(tmp_path / "old.csv")) == tmp_path / "old.csv"
     with pytest.raises(ArgumentTypeError, match=r"i\.csv"):
         outputs.folder("i.csv")
-
-
-def test_a_file_has_its_ending_or_none():
-    """All that are allowed are named."""
     read = outputs.file(".svg", ".html")
     assert (read("a.SVG"), read("a")) == (Path("a.SVG"), Path("a"))
     with pytest.raises(ArgumentTypeError, match=r"\.html"):

@@ -42,7 +42,7 @@ def test_a_service_tries_again_with_a_growing_pause(monkeypatch, logged):
 
 
 def test_only_a_service_waits_for_errors_that_pass():
-    """A full disk or too many files; in a terminal the error ends the command."""
+    """A full disk, a port in use, a missing address; a person hears at once."""
     clock, calls, make = refusing(1)
     with pytest.raises(AddressError):
         retry.retried(make, clock)
@@ -51,6 +51,13 @@ def test_only_a_service_waits_for_errors_that_pass():
     staying = [OSError(n, "") for n in (errno.ENOENT, errno.EACCES, errno.EROFS)]
     assert all(map(errors.passes, passing))
     assert not any(map(errors.passes, [*staying, ValueError("x")]))
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        for access in (Access(taken.getsockname()[1]), Access(0, "192.0.2.7")):
+            with pytest.raises(AddressError) as e:
+                PageServer("watch.html", access, SystemClock().now_ns)
+            assert e.value.exit_code == 69
+    with pytest.raises(ConfigError):
+        PageServer("watch.html", Access(70_000), SystemClock().now_ns)
 
 
 def test_a_stop_ends_the_wait(monkeypatch):
@@ -82,14 +89,3 @@ def test_how_a_command_ends():
     assert {code: {kind.exit_code for kind in kinds} for code, kinds in codes.items()} == {
         code: {code} for code in codes
     }
-
-
-def test_a_page_whose_port_is_in_use_or_whose_address_is_missing():
-    """Both are restarted; a port that does not exist is not."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        for access in (Access(taken.getsockname()[1]), Access(0, "192.0.2.7")):
-            with pytest.raises(AddressError) as e:
-                PageServer("watch.html", access, SystemClock().now_ns)
-            assert e.value.exit_code == 69
-    with pytest.raises(ConfigError):
-        PageServer("watch.html", Access(70_000), SystemClock().now_ns)

@@ -15,7 +15,7 @@ from tests.factories.paths import ROOT
 
 
 def test_all_that_is_said_of_a_status_is_of_the_table():
-    """PROTOCOL.md, page, Modbus, card: every status, in order."""
+    """PROTOCOL.md, page, Modbus, card: every status, in order, with words but for `ok`."""
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
     listed = protocol.split("| status | meaning")[1].split("\n\n")[0]
     assert re.findall(r"(?m)^\| `([a-z-]+)` \|", listed) == [*Status]
@@ -26,10 +26,6 @@ def test_all_that_is_said_of_a_status_is_of_the_table():
     _, script = page_files()["/statuses.js"]
     shown = json.loads(script.decode().removeprefix("export const STATUSES = ").rstrip(";\n"))
     assert shown == {s: [w.colour, w.word, w.advice] for s, w in WORDS.items()}
-
-
-def test_the_table_is_whole():
-    """All but `ok` have words, also each reason with its numbers; only `ok` is used."""
     assert set(DETAILS) == set(Reason)
     remark = Remark(Reason.UNLIKE_ALL, {"distance": 41.25, "label": "wood", "limit": 30.0})
     assert [part in remark.text for part in ("41.25", "wood", "30")] == [True] * 3

@@ -10,14 +10,17 @@ import pytest
 from palpate.core import storage
 
 
-def test_folders_are_made_once_and_a_failed_exchange_says_why(tmp_path):
-    """With missing parents; the system's error arrives with number and name."""
+def test_folders_are_made_once_and_what_fails_is_said(tmp_path):
+    """With missing parents; a folder, a file in no folder, and the system's error."""
     for name in ("a", "b"):
         storage.put(tmp_path / "one" / "two" / name, name.encode(), parents=True)
     assert sorted(os.listdir(tmp_path / "one" / "two")) == ["a", "b"]
     with pytest.raises(FileNotFoundError) as e:
         storage.exchange(tmp_path, tmp_path / "none")
     assert (e.value.errno, e.value.filename) == (errno.ENOENT, str(tmp_path / "none"))
+    assert "folder" in storage.refused(tmp_path)
+    assert "folder" in storage.refused(tmp_path / "none" / "file")
+    assert not storage.refused(tmp_path / "file")
 
 
 @pytest.mark.parametrize("durable", [True, False])
@@ -28,10 +31,3 @@ def test_only_a_durable_file_is_synced(tmp_path, monkeypatch, durable):
     storage.put_all({tmp_path / "a": b"1", tmp_path / "b": b"2"}, durable=durable)
     wanted = [f"{tmp_path}/a.part", f"{tmp_path}/b.part", str(tmp_path)]
     assert synced == (wanted if durable else [])
-
-
-def test_what_could_not_be_written(tmp_path):
-    """A folder and a file in no folder are refused; a new file is not."""
-    assert "folder" in storage.refused(tmp_path)
-    assert "folder" in storage.refused(tmp_path / "none" / "file")
-    assert not storage.refused(tmp_path / "file")

@@ -76,16 +76,12 @@ def test_a_setting_refuses_it(box):
         strict.running()
 
 
-def test_a_label_is_enrolled_into_a_taught_bundle(box):
-    """Both signatures are of this box, and both are shown."""
+def test_a_taught_bundle_takes_labels_and_the_desktops_signature(box):
+    """Both signatures are shown; the desktop's counts then, with its counter."""
     box.store.learn(taught(box))
     grown = deliveries.enrolled(dict(box.store.running().files), box.enrolment_key)
     box.store.learn(grown)
     assert box.store.running().signer == "taught here, enrolled here"
-
-
-def test_signed_on_a_desktop_it_is_a_delivery(box):
-    """The desktop's signature counts then, with its counter."""
     held = taught(box)
     own = held.pop(bundle.TAUGHT_SIGNATURE)
     manifest = replace(Manifest.parse(held[bundle.MANIFEST]), counter=3)

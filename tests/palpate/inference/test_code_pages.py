@@ -70,14 +70,10 @@ def test_nothing_else_is_touched(tmp_path):
     assert give_back(LIBRARY, tmp_path / "maps") == 0
 
 
-def test_what_linux_refuses_counts_nothing(tmp_path):
-    """Linux refuses a range that is not mapped."""
+def test_a_name_with_blanks_is_a_name_and_a_refusal_counts_nothing(tmp_path):
+    """All code of the file and none of another; a range that is not mapped is refused."""
     (tmp_path / "maps").write_text("1000-2000 r-xp 00000000 00:00 1 /lib.so\n")
     assert give_back("/lib.so", tmp_path / "maps") == 0
-
-
-def test_a_name_with_blanks_is_a_name(tmp_path):
-    """All code pages of the file are released, and none of another."""
     lines = [line for line in Path("/proc/self/maps").read_text().splitlines() if " r-xp " in line]
     own = [line.replace(LIBRARY, "/a  library.so") for line in lines if line.endswith(LIBRARY)]
     (tmp_path / "maps").write_text("\n".join([*own, *lines]))

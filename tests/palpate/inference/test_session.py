@@ -58,14 +58,19 @@ def test_a_classifier_opens_what_its_answers_need(tmp_path, opened, more, wanted
     assert opened == [wanted]
 
 
-def test_early_heads_have_their_own_session(tmp_path, opened):
-    """It is opened with the EarlyExit, before the first sweep, and once."""
+def test_early_heads_have_a_session_and_missing_outputs_none(tmp_path, opened):
+    """Opened once, before the first sweep; an output is refused when it is requested."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS), VirtualClock())
     EarlyExit(it)
     assert opened == [["logits", "embedding"], ["early"]]
     it.outputs(toy_bundle.window(1, 0), "early")
     EarlyExit(it)
     assert len(opened) == 2
+    it = ModelRunner(toy_bundle.model(), "logits")
+    with pytest.raises(BundleError, match=r"\['early'\]"):
+        it(("early",), toy_bundle.window(0, 0))
+    (logits,) = it(("logits",), toy_bundle.window(0, 0))
+    assert logits.shape == (3,)
 
 
 def test_answers_are_the_same_with_early_heads_and_without(default_bundle):
@@ -85,15 +90,6 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle):
         for it in (plain, early):
             assert it.logits(window).tobytes() == want["logits"].tobytes()
             assert it.outputs(window, "embedding")[0].tobytes() == want["embedding"].tobytes()
-
-
-def test_an_output_that_the_model_does_not_give(tmp_path):
-    """The output is refused when it is requested. The other outputs can still be requested."""
-    it = ModelRunner(toy_bundle.model(), "logits")
-    with pytest.raises(BundleError, match=r"\['early'\]"):
-        it(("early",), toy_bundle.window(0, 0))
-    (logits,) = it(("logits",), toy_bundle.window(0, 0))
-    assert logits.shape == (3,)
 
 
 FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {

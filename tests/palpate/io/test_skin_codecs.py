@@ -185,8 +185,8 @@ def test_lines_between_other_lines():
         replace(p, lines="rows")
 
 
-def test_anyskin_byte_by_byte():
-    """Five times (t, x, y, z), CR LF: the temperature is left out, z is last."""
+def test_anyskin_reskin_and_vitac_byte_by_byte():
+    """Without temperature, z last; rows that a shorter line ends, numbers out of range."""
     values = [25.0, 1.0, 2.0, 3.0] * 4 + [25.0, 7.0, 8.0, 9.5]
     frame = struct.pack("<20f", *values) + b"\r\n"
     assert len(frame) == 82
@@ -195,10 +195,6 @@ def test_anyskin_byte_by_byte():
     assert found.taxels[0, 0, 0].tolist() == [1, 2, 3]
     assert found.taxels[0, 4, 0].tolist() == [7, 8, 9.5]
     assert found.rest.data == b"\r\n"
-
-
-def test_reskin_and_vitac_lines():
-    """Decimal text; rows that a shorter line ends; a number out of range makes it invalid."""
     found = decoded(profile("reskin"), b"25.0\t1\t-2.5\t3e2\t" * 4 + b"25,1,2,3\r\n" + b"1 2 3\n")
     assert found.taxels[0, 0, 0].tolist() == [1, -2.5, 300]
     assert (len(found), found.garbage) == (1, 6)

@@ -334,8 +334,8 @@ def test_once_in_step_a_mark_in_the_payload_does_no_harm(name):
     assert all(one.tobytes() in known for one in skin.seconds(3).taxels)
 
 
-def test_a_port_named_by_id_tells_its_serial_number(tmp_path):
-    """A name by id is a link; the identity of the skin does not depend on the name of its port."""
+def test_a_port_by_id_has_a_serial_number_and_a_misfit_its_value(tmp_path):
+    """Whatever the port's name; values that turn negative are named with their type."""
     link = tmp_path / "usb-skin-S1"
     link.symlink_to(PATH)
     for port in (PATH, str(link)):
@@ -343,6 +343,13 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path):
         skin.seconds(0.1)
         assert skin.sensor.identity
         assert skin.sensor.identity.serial == "S1"
+    skin = WiredSkin("3d-vitac")
+    skin.seconds(3)
+    assert skin.sensor.state == "streaming"
+    skin.port.mangle = lambda data: data.replace(b" ", b" -", 1)
+    skin.seconds(3)
+    assert skin.sensor.state == "mismatch"
+    assert re.search(r"-\d+, which uint16 ", str(skin.sensor.trouble))
 
 
 @pytest.mark.parametrize("name", ["flexitac", "reskin"])
@@ -366,17 +373,6 @@ def test_a_board_that_boots_whenever_it_is_opened(name):
     assert skin.sensor.state == "streaming"
     assert skin.sensor.counters.enumerations <= 4
     assert any("skin.silence_ms" in trouble for trouble in skin.troubles), skin.troubles
-
-
-def test_a_text_that_stops_fitting_names_the_value():
-    """Values turn negative after some seconds: the trouble names the value and its type."""
-    skin = WiredSkin("3d-vitac")
-    skin.seconds(3)
-    assert skin.sensor.state == "streaming"
-    skin.port.mangle = lambda data: data.replace(b" ", b" -", 1)
-    skin.seconds(3)
-    assert skin.sensor.state == "mismatch"
-    assert re.search(r"-\d+, which uint16 ", str(skin.sensor.trouble))
 
 
 def test_a_sequence_number_shows_each_loss():

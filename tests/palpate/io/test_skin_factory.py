@@ -51,16 +51,12 @@ def test_the_protocol_has_the_old_sensor_and_a_wrong_profile_none():
         skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 
 
-def test_a_rate_that_can_be_set_is_that_of_the_bundle():
-    """A bundle for 250 Hz sets a skin that has this rate; other rates are refused."""
+def test_rate_and_form_are_the_bundles_or_a_persons():
+    """250 Hz if the skin has it; the error's examples are understood, two seconds long."""
     simulated, chosen = idle_devices(), settings("skin.profile=papillarray")
     wanted = SweepFormat(3, 3, 250, 500, "float32", 3)
     assert skins.announced(chosen, simulated, wanted) == wanted
     assert skins.announced(chosen, simulated, replace(wanted, rate_hz=300)).rate_hz == 1000
-
-
-def test_a_form_that_a_person_describes():
-    """The error's examples are understood, with a window of two seconds."""
     assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
     assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
     with pytest.raises(ConfigError, match="5x3"):

@@ -291,8 +291,8 @@ def test_a_board_that_answers_and_sends_no_frame(acm):
     assert reading.sensor.state == "streaming"
 
 
-def test_overflow_loses_one_transfer():
-    """A transfer larger than requested is lost and counted; streaming goes on."""
+def test_transfers_too_large_or_too_late_are_counted():
+    """One is lost with its frames; after a pause the newest come, with gap and flag."""
     reading = SensorReading()
     reading.seconds(1)
     once = iter([bytes(100_000)])
@@ -300,10 +300,6 @@ def test_overflow_loses_one_transfer():
     check_content(reading.seconds(1))
     assert reading.sensor.state == "streaming"
     assert (reading.sensor.counters.overflows, reading.sensor.counters.lost_frames) == (1, 4)
-
-
-def test_a_host_that_pauses_too_long():
-    """The FIFO overflows: the newest frames come, and gap and flag are counted."""
     reading = SensorReading(fifo_frames=188)
     reading.seconds(1)
     reading.pause(2)

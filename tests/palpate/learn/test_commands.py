@@ -32,8 +32,8 @@ def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str
     return code, "".join(capsys.readouterr())
 
 
-def test_settings_and_simulated_sweeps_are_refused(options, capsys):
-    """With teach.allow = false nothing works; --sim needs a folder of its own."""
+def test_nothing_is_taught_without_leave_or_sweeps(options, capsys):
+    """teach.allow = false, --sim without a folder, nothing recorded: no bundle."""
     for more in (["--use"], ["--label", "cork", "--sim", "skin"], ["--forget", "cork"]):
         code, text = said([*options, "--set", "teach.allow=false", *more], capsys)
         assert code == 78
@@ -41,6 +41,10 @@ def test_settings_and_simulated_sweeps_are_refused(options, capsys):
     code, text = said(["--label", "cork", "--sim", "skin"], capsys)
     assert code == 78
     assert "--sim" in text
+    code, text = said(options, capsys)
+    assert code == 1
+    assert "cannot" in text
+    assert "service" in text
 
 
 def test_a_box_without_a_key_says_so_before_sweeps(options, tmp_path, capsys):
@@ -61,14 +65,6 @@ def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(options, tmp
     assert code == 78
     assert "output.class_bits" in text
     assert not list((tmp_path / "store" / "sweeps").glob("*.npy"))
-
-
-def test_nothing_recorded_yet(options, capsys):
-    """The reason, and no bundle."""
-    code, text = said(options, capsys)
-    assert code == 1
-    assert "cannot" in text
-    assert "service" in text
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from tests.factories import terminals
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
 
-def test_demo_prints_plain_lines_without_a_terminal(capsys):
-    """Heads, each sweep with truth and answer, then the sum and what to do next."""
+def test_demo_prints_plain_lines_or_sentences_alone(capsys):
+    """Truth, answer, sum, next step; raw the same with the same seed."""
     assert main(["demo", *VIRTUAL]) == 0
     out = capsys.readouterr().out
     assert "$PPLP" not in out
@@ -31,6 +31,12 @@ def test_demo_prints_plain_lines_without_a_terminal(capsys):
     assert "0 of" in out
     assert "--virtual" in out
     assert "\033" not in out
+    assert main(["demo", "--raw", *VIRTUAL]) == 0
+    first = capsys.readouterr().out
+    assert all(line.startswith("$PPLP,") for line in first.splitlines())
+    assert first.count(",RES,") == 3
+    main(["demo", "--raw", *VIRTUAL])
+    assert capsys.readouterr().out == first
 
 
 @pytest.mark.slow
@@ -73,16 +79,6 @@ def test_ctrl_c_ends_with_its_exit_code(number, code):
         run.send_signal(number)
         run.stdout.read()
         assert run.wait(timeout=30) == code
-
-
-def test_demo_raw_prints_sentences_alone(capsys):
-    """The output is sentences alone, and the same in every run with the same seed."""
-    assert main(["demo", "--raw", *VIRTUAL]) == 0
-    first = capsys.readouterr().out
-    assert all(line.startswith("$PPLP,") for line in first.splitlines())
-    assert first.count(",RES,") == 3
-    main(["demo", "--raw", *VIRTUAL])
-    assert capsys.readouterr().out == first
 
 
 def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:

@@ -56,8 +56,8 @@ def test_another_grid_of_a_known_skin():
     assert found.profile in ("flexitac", "matrix")
 
 
-def test_a_skin_that_has_to_be_asked():
-    """Nothing is written without --write; with it the profile is found, and it is stopped."""
+def test_skins_and_boards_that_have_to_be_asked():
+    """Nothing is written without --write; with it they are found, and stopped."""
     clock, p = VirtualClock(), profile("robotiq-tsf")
     start = p.commands(p.start, p.rate_hz)[0]
     port = WirePort(clock, lambda i: b"", p.format.period_ns)
@@ -68,10 +68,6 @@ def test_a_skin_that_has_to_be_asked():
     assert "--write" in found.detail
     assert found_on(port, clock, write=True).profile == "robotiq-tsf"
     assert port.sent[-1] == p.commands(p.stop, p.rate_hz)[-1]
-
-
-def test_a_board_of_the_protocol_has_to_be_asked():
-    """With --write the identity is asked for, and the answer is the board's."""
     clock = VirtualClock()
     who = packets.pack_reply(
         packets.Request.IDENTITY, packets.pack_identity(packets.Identity(1, (1, 0, 0), "pico", "7"))

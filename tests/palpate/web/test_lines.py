@@ -53,10 +53,12 @@ def test_each_event_in_words(line, said):
     assert event(line, {}, 0) == said
 
 
-def test_a_verdict_has_the_name_for_people():
-    """Sweep, label as people call it, probability; unknown members are ignored."""
+def test_a_verdict_has_the_name_for_people_and_a_feed_that_is_off_none(capsys):
+    """Unknown members are ignored; the message gives the setting."""
     said = event(VERDICT | {"more": 1}, {"plastic rough": "Kunststoff"}, 10**9)
     assert re.search(r"7 .*1 s .*ok .*ff .*98\.7", said)
+    assert main(["watch", "--set", "store.runtime="]) == ConfigError.exit_code
+    assert "store.runtime" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -140,9 +142,3 @@ def test_json_passes_the_lines_on(offered):
     assert set(said) == {""}
     pass_on(str(offered.path) + "x", out, SystemClock(), iter([False, True]).__next__, said.append)
     assert said[-1]
-
-
-def test_a_feed_that_is_off_cannot_be_watched(capsys):
-    """The message gives the setting."""
-    assert main(["watch", "--set", "store.runtime="]) == ConfigError.exit_code
-    assert "store.runtime" in capsys.readouterr().err

@@ -51,16 +51,12 @@ def test_the_owner_of_a_connection(host):
         assert local_users.owner(places[0], (host, 1)) is None
 
 
-def test_who_may_see_the_box():
-    """Root and this user; nobody unknown."""
+def test_another_user_gets_nothing(page, monkeypatch):
+    """Root and this user see the box; the answer to others names the group."""
     assert local_users.may_see(0)
     assert local_users.may_see(os.geteuid())
     assert not local_users.may_see(None)
     assert not local_users.may_see(987_654)
-
-
-def test_another_user_gets_nothing(page, monkeypatch):
-    """Neither the page nor its events; the answer names the group."""
     assert status(page)[0] == 200
     monkeypatch.setattr(local_users, "owner", lambda peer, own: 987_654)
     code, why = status(page)

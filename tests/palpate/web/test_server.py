@@ -93,12 +93,15 @@ def test_a_browser_gets_what_is_kept_and_then_what_comes(page):
     again.socket.close()
 
 
-def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page):
-    """ValueError there; the server goes on."""
+def test_numbers_without_json_and_taken_ports_are_errors(page):
+    """ValueError where it is published; a ConfigError with port and remedy."""
     with pytest.raises(ValueError, match="JSON"):
         page.publish("view", float("nan"))
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
+    for taken in (port(page), 70_000):
+        with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
+            PageServer("watch.html", Access(taken), now_ns)
 
 
 @pytest.mark.parametrize(
@@ -288,13 +291,6 @@ def test_a_browser_that_goes_is_forgotten(page, rudely):
         reader.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
     reader.socket.close()
     until(lambda: not page.watched)
-
-
-def test_a_port_that_is_taken_is_named(page):
-    """A ConfigError names the port and the remedy, also for an invalid port number."""
-    for taken in (port(page), 70_000):
-        with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
-            PageServer("watch.html", Access(taken), now_ns)
 
 
 def test_without_tornado_it_says_what_to_install(tmp_path):

@@ -38,7 +38,7 @@ def positions_of(
 
 
 def test_the_places_of_a_training_set():
-    """One centre per numbered position, in mm, else per recording, else per sweep."""
+    """One centre a position, in mm, else a recording or a sweep; None without pitch."""
     at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
     for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
         found = positions_of(trained(*at, group=group, each=each), LOADS, pitch_mm=2.0)
@@ -48,6 +48,13 @@ def test_the_places_of_a_training_set():
         assert np.stack([found.rows_mm, found.cols_mm], 1) == pytest.approx(
             2.0 * np.array(want), abs=1e-3
         )
+    assert positions_of(trained((1.5, 1.5)), LOADS) is None
+    assert positions_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0) is None
+    both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
+    found = positions_of(both, LOADS)
+    assert found.pitch_mm == skin.PITCH_MM
+    assert len(found.rows_mm) == 2
+    assert np.stack([found.rows_mm, found.cols_mm]) == pytest.approx(np.full((2, 2), 6.0), abs=1.5)
 
 
 def test_each_position_is_left_out_and_many_are_thinned():
@@ -63,17 +70,6 @@ def test_each_position_is_left_out_and_many_are_thinned():
     assert np.median(np.diff(found.cols_mm)) < 0.02
     assert found.cols_mm[0] == 4.0
     assert found.cols_mm[-1] > 7.9
-
-
-def test_sets_without_positions():
-    """Without a pitch, or without contact, positions are None; simulated sets have a pitch."""
-    assert positions_of(trained((1.5, 1.5)), LOADS) is None
-    assert positions_of(trained((1.5, 1.5)), ContactLimit(500.0, TARE), pitch_mm=4.0) is None
-    both = sets.join([sets.load("sim:T-LAB:1:1"), sets.load("sim:T-LAB:2:1")])
-    found = positions_of(both, LOADS)
-    assert found.pitch_mm == skin.PITCH_MM
-    assert len(found.rows_mm) == 2
-    assert np.stack([found.rows_mm, found.cols_mm]) == pytest.approx(np.full((2, 2), 6.0), abs=1.5)
 
 
 def known(drift: float = 0.0, load: float = 1000.0) -> Dataset:

@@ -60,8 +60,8 @@ def test_the_rule_decides_when_the_steps_are_certain():
     assert "95%" in fit_early.find_rule(certain(labels, np.full(300, 9)), labels).why
 
 
-def test_a_rule_asks_for_agreement_where_one_step_deceives():
-    """One certain tenth is wrong in 2 % of the sweeps; two that agree never are."""
+def test_a_rule_asks_for_agreement_and_the_strictest_level():
+    """One certain tenth is wrong in 2 %; luck at a looser level does not count."""
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
@@ -70,19 +70,6 @@ def test_a_rule_asks_for_agreement_where_one_step_deceives():
     assert found.early.agree == 2
     assert found.share == pytest.approx(0.4, abs=0.01)
     assert found.lost == 0
-
-
-@pytest.mark.parametrize(("wrong", "off"), [(1, False), (2, True)])
-def test_half_a_point_and_no_more(wrong: int, off: bool):
-    """Of 300 sweeps one may turn wrong, two, which stay wrong, may not."""
-    labels = np.arange(300) % 3
-    found = fit_early.find_rule(certain(labels, np.full(300, 2), range(wrong)), labels)
-    assert (found.early is None) is off
-    assert bool(found.why) is off
-
-
-def test_no_looser_level_after_one_that_lost():
-    """Levels are tried from the strictest on; luck at a looser level does not count."""
     labels = np.arange(200) % 3
     p = certain(labels, np.full(200, 9))
     p[:, 4] = 0.05
@@ -93,6 +80,15 @@ def test_no_looser_level_after_one_that_lost():
         fit_early.find_rule(p, labels).early is None
         or fit_early.find_rule(p, labels).early.least[0] > 0.96
     )
+
+
+@pytest.mark.parametrize(("wrong", "off"), [(1, False), (2, True)])
+def test_half_a_point_and_no_more(wrong: int, off: bool):
+    """Of 300 sweeps one may turn wrong, two, which stay wrong, may not."""
+    labels = np.arange(300) % 3
+    found = fit_early.find_rule(certain(labels, np.full(300, 2), range(wrong)), labels)
+    assert (found.early is None) is off
+    assert bool(found.why) is off
 
 
 @pytest.mark.parametrize("agree", [1, 2, 3])

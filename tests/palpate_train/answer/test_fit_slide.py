@@ -29,8 +29,8 @@ def swept(speeds: list[float]) -> Dataset:
     return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")
 
 
-def test_the_range_covers_nearly_all_sweeps():
-    """Within the error of the measurement; two wrong ones of a hundred do not widen it."""
+def test_the_range_covers_nearly_all_sweeps_or_has_a_reason():
+    """Two wrong of a hundred do not widen it; without pitch, sweeps or slides none."""
     found, why = trained_speeds(swept([1.0, 2.0] * 4 + [1.5]), skin.PITCH_MM)
     assert found
     assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 60.0), rel=0.03)
@@ -38,10 +38,6 @@ def test_the_range_covers_nearly_all_sweeps():
     found, _ = trained_speeds(swept([1.0] * 98 + [0.6, 3.0]), skin.PITCH_MM)
     assert found
     assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 30.0), rel=0.05)
-
-
-def test_without_a_range_the_reason_is_given():
-    """No pitch; too few sweeps; sweeps in which nothing slides."""
     sweeps = swept([1.0] * 6)
     resting = replace(sweeps, samples=np.repeat(sweeps.samples[:, :1], 1500, axis=1))
     for trained, pitch_mm, why in (

@@ -54,8 +54,8 @@ def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Ge
     assert rule.weights["other"] < rule.weights["hum"] or rule.weights["other"] <= 1
 
 
-def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
-    """At a squared distance of r on average, as for enrolled labels without a shape."""
+def test_shapes_keep_distances_and_are_shared(rng: Generator):
+    """At r on average, as without a shape; without copies the scatter of the others."""
     scatters, judged = Scatters.of(sweeps(rng, hum=HUM), SPACE), sweeps(rng, hum=HUM)
     rule = choose(scatters, judged)
     assert rule
@@ -64,10 +64,6 @@ def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
     own = distances[np.arange(len(judged.z)), judged.labels]
     assert own.mean() == pytest.approx(4, rel=0.01)
     assert np.mean(own <= rule.limit) == pytest.approx(0.99, abs=0.011)
-
-
-def test_a_material_without_copies_has_the_scatter_of_the_others(rng: Generator):
-    """The copies are of two of three materials."""
     given = sweeps(rng, hum=HUM)
     z, source = given.copies["hum"]
     few = given.labels[source] != 2

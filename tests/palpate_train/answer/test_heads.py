@@ -100,14 +100,16 @@ def test_recordings_are_no_condition_and_a_material_without_sweeps_is_never_name
     assert not weight[2].any()
 
 
-def test_logits_of_many_features_stay_above_a_missing_material():
-    """The largest logit is above ABSENT, however large the weights are."""
+def test_logits_stay_above_a_missing_material_and_one_sweep_is_too_few():
+    """Above ABSENT, however large the weights; the message counts the sweeps."""
     x, labels = drawn(60, 59)
     weight, bias = heads.fit_discriminant(1e-3 * x + 1e3, labels, 5)
     assert (x.astype(np.float64) @ weight.T + bias).shape == (60, 5)
     logits = (1e-3 * x + 1e3) @ weight.T.astype(np.float64) + bias
     assert (logits.max(axis=1) > heads.ABSENT).all()
     assert set(logits.argmax(axis=1)) <= {0, 1, 2, 3}
+    with pytest.raises(FormatError, match="3 sweeps"):
+        heads.fit_discriminant(np.eye(3), np.arange(3), 3)
 
 
 def test_features_without_scatter_leave_finite_heads():
@@ -123,12 +125,6 @@ def test_features_without_scatter_leave_finite_heads():
     x = np.repeat([[0.0, 1.0], [2.0, 1.0]], 3, axis=0)
     weight, bias = heads.fit_discriminant(x, labels, 2)
     assert (x @ weight.T + bias).argmax(axis=1).tolist() == labels.tolist()
-
-
-def test_one_sweep_of_each_material_is_too_few():
-    """The message counts them."""
-    with pytest.raises(FormatError, match="3 sweeps"):
-        heads.fit_discriminant(np.eye(3), np.arange(3), 3)
 
 
 @pytest.mark.parametrize("size", [10, 200])

@@ -46,12 +46,16 @@ def parsed(folder: Path, text: str, *more: str) -> argparse.Namespace:
 
 
 def test_every_option_can_stand_in_the_file(tmp_path: Path):
-    """Texts, numbers, flags and lists; a set that is a file lies beside the scene."""
+    """Texts, numbers, flags, lists, a set beside the scene; bytes beyond UTF-8 are refused."""
     found = parsed(tmp_path, WHOLE)
     assert found.sets == [str(tmp_path / "a.npz"), "sim:T-LAB:1001:1"]
     assert (found.only, found.rename) == (["force<=180"], ["c=a"])
     assert (found.budget_ms, found.budget_kb, found.accuracy, found.slower) == (5, 96.5, 0.9, 3)
     assert (found.reduce, found.reattached, found.size) == (["window", "rate"], True, "64")
+    path = tmp_path / "scene.toml"
+    path.write_bytes(b'size = "\xff"')
+    with pytest.raises(FormatError, match="not TOML"):
+        scene_file.words(path, command())
 
 
 def test_the_command_line_and_variables_change_the_file(
@@ -86,14 +90,6 @@ def test_what_is_wrong_is_named(text: str, why: str, tmp_path: Path):
     """The message has the file, the key, the value, and the allowed or nearest one."""
     with pytest.raises(FormatError, match=why):
         parsed(tmp_path, text)
-
-
-def test_a_file_that_is_not_text_is_refused(tmp_path: Path):
-    """Bytes that are not UTF-8."""
-    path = tmp_path / "scene.toml"
-    path.write_bytes(b'size = "\xff"')
-    with pytest.raises(FormatError, match="not TOML"):
-        scene_file.words(path, command())
 
 
 @pytest.mark.parametrize("name", ["tubes.toml", "fabrics.toml"])

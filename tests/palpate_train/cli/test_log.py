@@ -78,8 +78,8 @@ def test_a_log_has_a_line_now_and_then(
     assert (kept, later) == ("kept", ProgressLine.of(1, 2, 3.0, "a fold"))
 
 
-def test_a_stage_that_has_ended_stays_with_its_time(capsys: pytest.CaptureFixture[str]):
-    """A line for each stage, whatever it said meanwhile; the end checks the last one, once."""
+def test_a_stage_knows_how_much_is_done_and_stays_with_its_time(capsys: pytest.CaptureFixture[str]):
+    """A training says its step; the end checks the last stage, once."""
     log = options.Log()
     for stage, what in ((1, "features of 9 sweeps"), (2, "choosing: a"), (2, "choosing: b")):
         log(StageLine.of(stage, 2, ("features", "choice")[stage - 1], what))
@@ -88,10 +88,6 @@ def test_a_stage_that_has_ended_stays_with_its_time(capsys: pytest.CaptureFixtur
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == ["features", "choice"]
     assert all(line.endswith(" 0 s") for line in lines)
-
-
-def test_a_stage_knows_how_much_of_it_is_done():
-    """A training says its step; other work says nothing about its end."""
     known = StageLine.of(3, 3, "training", "step 300/1200 loss 0.31, 9 s left")
     assert known.startswith("part 3 of 3, step")
     assert known.within == 0.25

@@ -93,8 +93,8 @@ def test_a_line_of_taxels_is_not_moved(rows: int):
     np.testing.assert_array_equal(varied(x, rows, shift=1.0, displaced=1.0), x)
 
 
-def test_gains_are_of_all_taxels_or_of_each():
-    """`gain` is of all taxels of a sweep, `gains` of each; both are constant over time."""
+def test_gains_and_stretches_stay_within_the_asked():
+    """`gain` of all taxels, `gains` of each; 20 turns become 14 to 26."""
     x = sweeps(400, frames=20)
     for name, taxels in (("gain", 1), ("gains", 16)):
         ratio = varied(x, **{name: 0.3}) / x
@@ -104,6 +104,12 @@ def test_gains_are_of_all_taxels_or_of_each():
         assert log.std() == pytest.approx(0.3, rel=0.15)
         assert abs(log.mean()) < 0.05
         assert (log.std(axis=1).max() < 1e-3) == (taxels == 1)
+    turns = np.tile(np.sin(2 * np.pi * 20 * np.arange(600, dtype=np.float32) / 600), (60, 1, 1))
+    peaks = np.abs(np.fft.rfft(varied(turns, 1, stretch=0.3))).argmax(axis=2)
+    assert peaks.min() >= 13
+    assert peaks.max() <= 27
+    assert peaks.min() < 17
+    assert peaks.max() > 23
 
 
 def test_a_share_of_the_taxels_is_silent_or_noisy():
@@ -117,16 +123,6 @@ def test_a_share_of_the_taxels_is_silent_or_noisy():
     assert 0.07 < (level > 0).mean() < 0.13
     assert 3 < level.max() < 4.5
     assert not (level > 0).all(axis=1).any()
-
-
-def test_a_stretch_changes_the_rate_by_no_more_than_asked():
-    """A sine of 20 turns has 14 to 26 at up to 30 % more or less speed."""
-    turns = np.tile(np.sin(2 * np.pi * 20 * np.arange(600, dtype=np.float32) / 600), (60, 1, 1))
-    peaks = np.abs(np.fft.rfft(varied(turns, 1, stretch=0.3))).argmax(axis=2)
-    assert peaks.min() >= 13
-    assert peaks.max() <= 27
-    assert peaks.min() < 17
-    assert peaks.max() > 23
 
 
 @pytest.mark.slow

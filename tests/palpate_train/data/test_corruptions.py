@@ -256,8 +256,8 @@ def test_hum_noise_and_lost_frames():
         assert np.allclose(got[i, :, 0, 1], want, atol=1e-4)
 
 
-def test_counts_are_digitized_again():
-    """uint8 ends at 255 and int16 stays whole: a higher gain saturates without overflow."""
+def test_counts_are_digitized_again_and_large_sets_thinned():
+    """255 and whole numbers without overflow; about `most` sweeps, evenly."""
     sweeps = small("uint8")
     sweeps.samples[:, :, 1, 1] = 200
     up = BY_NAME["gain-up"].apply(EvaluationSweeps(sweeps), 0.5, 0)
@@ -266,6 +266,12 @@ def test_counts_are_digitized_again():
         BY_NAME["gain-down"].apply(EvaluationSweeps(small()), 0.5, 0)
         == np.rint(small().samples / 2)
     ).all()
+    sweeps = small("uint8", (40, 20, 1, 1))
+    assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
+    assert np.bincount(EvaluationSweeps.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]
+    one, same, other = (EvaluationSweeps.of(sweeps, 10, seed).sweeps.samples for seed in (1, 1, 2))
+    assert (one == same).all()
+    assert (one != other).any()
 
 
 def test_the_grid_is_read_elsewhere():
@@ -283,16 +289,6 @@ def test_the_grid_is_read_elsewhere():
     was[:] = np.array([[0, 1], [1, 2], [2, 3], [3, 4]]) * 10.0 + 10
     quarter = corruptions._regrid(was[:, :, 1:3], 0.0, 90.0, 0.0, np.random.default_rng(0))[0, 0]
     assert np.allclose(quarter, [[30, 20], [40, 30]])  # x runs down the rows, y along the columns
-
-
-def test_fewer_sweeps_as_many_of_each():
-    """About `most` sweeps of a file, evenly over materials; a smaller file is whole."""
-    sweeps = small("uint8", (40, 20, 1, 1))
-    assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
-    assert np.bincount(EvaluationSweeps.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]
-    one, same, other = (EvaluationSweeps.of(sweeps, 10, seed).sweeps.samples for seed in (1, 1, 2))
-    assert (one == same).all()
-    assert (one != other).any()
 
 
 @pytest.mark.parametrize("spec", ["sim:T-NONE", "sim:T-LAB:3-2"])

@@ -136,8 +136,8 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
     np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
 
 
-def test_only_used_columns_must_be_clear():
-    """Is 2 a name or a number? A fault elsewhere does not matter; in a taxel it is named."""
+def test_only_used_columns_must_be_clear_numbers():
+    """Is 2 a name or a number? Texts are passed over, and refused by --columns."""
     with pytest.raises(FormatError, match="'2'"):
         frames.frames(text(("0", "1", "2", "3")), plan(grid="2x1", columns="2,3"))
     table = text(("t", "a", "b"), faults={2: "line 3, column 3 is '', which is not a number"})
@@ -146,6 +146,13 @@ def test_only_used_columns_must_be_clear():
         grid = "1x2" if asked == {"time": "t:s"} else "1x1"
         with pytest.raises(FormatError, match="column 3 is ''"):
             frames.frames(table, plan(grid=grid, **asked))
+    table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
+    found, _, _ = frames.frames(table, plan(grid="1x2"))
+    np.testing.assert_array_equal(found[:, 0], table.values[:, 1:])
+    with pytest.raises(FormatError, match="'label'"):
+        frames.frames(table, plan(grid="1x1", columns="label"))
+    with pytest.raises(FormatError, match="'wood'"):
+        frames.frames(table, plan(grid="1x2", time="label:s"))
 
 
 @pytest.mark.parametrize("shape", [(1, 40, 2, 3), (40, 1, 2, 3), (40, 2, 3, 1), (1, 2, 3, 40)])
@@ -157,17 +164,6 @@ def test_axes_of_length_one_are_left_out(shape: tuple[int, ...]):
     np.testing.assert_array_equal(found, values)
     found, _, _ = frames.frames(Table(values.reshape(40, 6, 1)), plan(grid="6x1"))
     np.testing.assert_array_equal(found, values.reshape(40, 6, 1))
-
-
-def test_text_columns_are_no_taxels():
-    """They are passed over without --columns, and refused if --columns names them."""
-    table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
-    found, _, _ = frames.frames(table, plan(grid="1x2"))
-    np.testing.assert_array_equal(found[:, 0], table.values[:, 1:])
-    with pytest.raises(FormatError, match="'label'"):
-        frames.frames(table, plan(grid="1x1", columns="label"))
-    with pytest.raises(FormatError, match="'wood'"):
-        frames.frames(table, plan(grid="1x2", time="label:s"))
 
 
 def test_a_column_of_dates_gives_the_times():

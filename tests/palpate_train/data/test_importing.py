@@ -108,6 +108,19 @@ def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
     np.testing.assert_array_equal(turned, whole.reshape(10, 4)[:, ::-1].reshape(10, 2, 2))
 
 
+def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
+    """Taxels would change places, silently. The place of the times does not matter."""
+    timed = np.column_stack([np.arange(40) / 100, COUNTS])
+    text(tmp_path / "felt_1.csv", np.roll(timed, -1, axis=1) + 1, head="a,b,c,d,t\n")
+    text(tmp_path / "felt_2.csv", timed[:, ::-1], head="d,c,b,a,t\n")
+    text(tmp_path / "wood_1.csv", timed, head="t,a,b,c,d\n")
+    ((name, why),) = reasons(tmp_path, time="t:s", rate_hz=None).items()
+    assert name == "felt_2.csv"
+    assert "'d' where" in why
+    made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
+    np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])
+
+
 @pytest.mark.parametrize("changes", [{}, {"variable": "{}"}])
 def test_a_pattern_without_a_field_matches(tmp_path: Path, changes: dict):
     """The material stands in a column: `{}.npz` takes every such file, and no other."""
@@ -363,19 +376,6 @@ def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
     for name in ("set.npz", "set.h5"):
         made.sweeps.save(tmp_path / name)
         assert sets.load(str(tmp_path / name)).displays == displays
-
-
-def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
-    """Taxels would change places, silently. The place of the times does not matter."""
-    timed = np.column_stack([np.arange(40) / 100, COUNTS])
-    text(tmp_path / "felt_1.csv", np.roll(timed, -1, axis=1) + 1, head="a,b,c,d,t\n")
-    text(tmp_path / "felt_2.csv", timed[:, ::-1], head="d,c,b,a,t\n")
-    text(tmp_path / "wood_1.csv", timed, head="t,a,b,c,d\n")
-    ((name, why),) = reasons(tmp_path, time="t:s", rate_hz=None).items()
-    assert name == "felt_2.csv"
-    assert "'d' where" in why
-    made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
-    np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])
 
 
 ARRAYS = {

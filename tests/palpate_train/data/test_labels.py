@@ -12,17 +12,13 @@ from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy
 
 
-def test_all_names_that_cannot_be_sent_are_listed():
-    """Each with its length and the remedy; valid names are not listed."""
+def test_names_that_cannot_be_sent_are_listed_and_equal_ones_joined():
+    """With length and remedy; labels follow, the order of the others stays."""
     s = replace(easy(4), materials=("x" * 25, "good one", ""))
     with pytest.raises(FormatError, match=r"x{25}' \(25 .*, '' \(0 "):
         labels.check(s)
     assert labels.unsendable(["a", "B 1.2_3-4", "x" * 24]) == ""
     assert labels.check(easy(4)).materials == ("low", "middle", "high")
-
-
-def test_materials_that_get_one_name_become_one():
-    """Labels follow; the order of the others stays; a set without the name is unchanged."""
     s = easy(2)
     joined = labels.renamed(s, {"high": "low", "other": "x"})
     assert (joined.materials, joined.labels.tolist()) == (("low", "middle"), [0, 0, 1, 1, 0, 0])

@@ -345,10 +345,15 @@ def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
     assert len(files(ground.here)) == 8
 
 
-def test_a_shell_that_talks_is_named(ground: Ground):
-    """A greeting before the list is not a file."""
+def test_a_shell_that_talks_and_a_missing_ssh_are_named(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+):
+    """A greeting before the list is not a file; the message says what to install."""
     ground.ssh("find", "echo Welcome")
     with pytest.raises(FormatError, match="b'Welcome"):
+        ground.fetch()
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ApplianceError, match="ssh "):
         ground.fetch()
 
 
@@ -405,13 +410,6 @@ def test_ssh_is_asked_without_questions(ground: Ground):
     assert asked[:6] == ["-o", "BatchMode=no", "-p", "2222", "-o", "BatchMode=yes"]
     assert asked[asked.index("--") + 1] == "user@box"
     assert "ConnectTimeout=10" in asked
-
-
-def test_no_ssh_here_is_told(ground: Ground, monkeypatch: pytest.MonkeyPatch):
-    """The message says what to install."""
-    monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(ApplianceError, match="ssh "):
-        ground.fetch()
 
 
 @pytest.fixture

@@ -194,6 +194,13 @@ def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
     assert (s.rate_hz, s.source) == (1000.0, "t.h5")
 
 
+def test_a_folder_of_sets_names_them(tmp_path: Path):
+    """The message names the sets: the user probably meant one of them."""
+    write(tmp_path / "a.npz")
+    with pytest.raises(FormatError, match="holds 1 "):
+        sets.load(str(tmp_path))
+
+
 def test_a_broken_tactmat_is_refused(tmp_path: Path):
     """Missing names or a wrong number of names, counts beyond a byte, unexpected labels."""
     for more, message in (
@@ -380,13 +387,6 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
     with pytest.raises(FormatError, match="palpate-train import"):
         sets.load(str(path))
     with pytest.raises(FormatError, match=f"1 {suffix.lower()} files: "):
-        sets.load(str(tmp_path))
-
-
-def test_a_folder_of_sets_names_them(tmp_path: Path):
-    """The message names the sets: the user probably meant one of them."""
-    write(tmp_path / "a.npz")
-    with pytest.raises(FormatError, match="holds 1 "):
         sets.load(str(tmp_path))
 
 

@@ -39,8 +39,8 @@ def test_windows_that_share_frames_are_found(hop: int, dtype: str):
     assert not len(repeats.pairs(a_set(windows(64, dtype))).first)
 
 
-def test_copies_are_counted_and_labels_told():
-    """Identical sweeps under one material and under two; three copies are three sweeps."""
+def test_copies_are_counted_once_a_fold():
+    """Under one material and two; three copies are three; test sweeps count once."""
     samples = noise(20)
     samples[7], samples[9] = samples[5], samples[5]
     found = repeats.pairs(a_set(samples))
@@ -50,6 +50,9 @@ def test_copies_are_counted_and_labels_told():
     samples[12] = samples[5]
     (line,) = repeats.warnings_of(a_set(samples), repeats.pairs(a_set(samples)))
     assert "4 of 20" in line
+    found = repeats.pairs(a_set(windows(32, "int16")))
+    assert found.across(np.arange(0, 10), np.arange(10, 19)).tolist() == [10]
+    assert found.across(np.arange(0, 19, 2), np.arange(1, 19, 2)).tolist() == [*range(1, 19, 2)]
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 9, 64])
@@ -60,13 +63,6 @@ def test_quiet_skins_do_not_count(frames: int):
     samples[:, frames // 2 :] = rng.integers(0, 200, (30, frames - frames // 2, 1, 1))
     found = repeats.pairs(a_set(samples, np.arange(30)))
     assert not (found.frames < frames).any()
-
-
-def test_pairs_across_a_fold():
-    """Test sweeps count once if they share frames with any training sweep."""
-    found = repeats.pairs(a_set(windows(32, "int16")))
-    assert found.across(np.arange(0, 10), np.arange(10, 19)).tolist() == [10]
-    assert found.across(np.arange(0, 19, 2), np.arange(1, 19, 2)).tolist() == [*range(1, 19, 2)]
 
 
 def test_a_sketch_knows_its_sweeps():

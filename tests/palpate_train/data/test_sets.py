@@ -240,7 +240,7 @@ def test_split_refuses_what_would_flatter():
 
 
 def test_join_keeps_recordings_apart_and_forces_together():
-    """Number 0 of two sets becomes two recordings; a speed of 2 stays 2."""
+    """Number 0 becomes two, a speed of 2 stays 2; `set` counts in the given order."""
     a, b = easy(4, pieces=2), easy(4, seed=1)
     both = sets.join([a, b])
     assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
@@ -251,6 +251,13 @@ def test_join_keeps_recordings_apart_and_forces_together():
     assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
     with pytest.raises(FormatError, match="differ"):
         sets.join([a, easy(4, dtype="int16")])
+    real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
+    both = sets.join([real, hard])
+    np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
+    np.testing.assert_array_equal(both.groups["world"], [1001] * 66 + [1002] * 12)
+    assert not set(both.groups["position"][:54]) & set(both.groups["position"][54:])
+    assert sets.join([hard]) is hard
+    assert "set" not in hard.groups
 
 
 def grouped(**groups: object) -> sets.Dataset:
@@ -317,17 +324,6 @@ def test_sets_are_joined_by_values():
     assert (mixed.groups["force"][0], mixed.units) == (300, {})
     with pytest.raises(FormatError, match="'force'"):
         sets.join([one, grouped(force__mm=[1] * 12)])
-
-
-def test_joined_sets_are_told_apart():
-    """`set` counts in the given order; a single set has no such group."""
-    real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
-    both = sets.join([real, hard])
-    np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
-    np.testing.assert_array_equal(both.groups["world"], [1001] * 66 + [1002] * 12)
-    assert not set(both.groups["position"][:54]) & set(both.groups["position"][54:])
-    assert sets.join([hard]) is hard
-    assert "set" not in hard.groups
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])

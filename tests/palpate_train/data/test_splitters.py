@@ -137,15 +137,11 @@ def test_protocols_speak_of_values():
     assert all(part.out.sum() == 4 for part in parts)
 
 
-def test_clusters_are_what_was_left_out_or_recordings():
-    """The left-out groups, else recordings of several windows, else None."""
+def test_clusters_and_learning_curves_follow_the_split():
+    """Left-out groups, recordings or None; so many of each, equal for equal seeds."""
     assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
     assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
     assert Protocol("random:3").clusters(a_set([0, 1])) is None
-
-
-def test_a_learning_curve_adds_to_what_was_there():
-    """So many of each material, from the training side, equal for equal seeds."""
     labels = np.repeat([0, 1, 2], [20, 8, 3])
     train = np.flatnonzero(np.arange(31) % 5)
     few, more = (draw(train, labels, each, 1) for each in (2, 6))

@@ -20,21 +20,15 @@ def uneven() -> Dataset:
     return replace(base, samples=samples, labels=labels, groups={"recording": recording})
 
 
-def test_a_set_is_itself_or_evenly_spaced():
-    """No copy of a small one; else windows in order, since neighbours overlap."""
+def test_a_set_is_itself_or_thinned_alike():
+    """In order; materials with few sweeps keep all, and no recording is lost."""
     s = uneven()
     assert thinned(s, len(s)) is s
-    part = thinned(uneven(), 63)
+    part = thinned(s, 63)
     numbers = part.samples[:, 0, 0, 0]
     assert (np.diff(numbers) > 0).all()
     longest = numbers[part.group("recording") == 7]
     assert set(np.diff(longest)) <= {14, 15, 16, 17}
-
-
-def test_materials_and_recordings_share_alike():
-    """A material with few sweeps keeps all; a long recording loses first; no recording is lost."""
-    s = uneven()
-    part = thinned(s, 63)
     assert len(part) == 63
     assert np.bincount(part.labels).tolist() == [3, 30, 30]
     counts = np.unique(part.group("recording"), return_counts=True)[1].tolist()

@@ -44,8 +44,8 @@ def test_frames_are_averaged(kind: str, mean: list[int]):
         Change(rate=13).of(counting())
 
 
-def test_low_bits_are_cut_off():
-    """For integer counts, also negative; a float set counts as eight bits over its range."""
+def test_low_bits_and_whole_rows_are_left_out():
+    """Also negative ones, floats as eight bits; else one column in order."""
     x = np.array([-5, -1, 0, 3, 4, 127], np.int16).reshape(1, 6, 1, 1).repeat(2, 0)
     cut = Change(bits=2).of(Dataset(x, np.array([0, 1]), ("a", "b"), 1.0))
     assert cut.samples[0].ravel().tolist() == [-8, -4, 0, 0, 4, 124]
@@ -53,10 +53,6 @@ def test_low_bits_are_cut_off():
     coarse = Change(bits=4).of(Dataset(ramp, np.array([0, 1]), ("a", "b"), 1.0)).samples
     assert len(np.unique(coarse)) == 17  # sixteen steps and the maximum
     assert np.abs(coarse - ramp).max() <= 2 / 16
-
-
-def test_rows_and_columns_stay_a_grid():
-    """Whole rows and columns left: a smaller grid; otherwise one column in order."""
     grid = Change(taxels=(5, 3, 0, 2)).of(counting()).samples
     assert grid.shape == (2, 12, 2, 2)
     assert grid[0, 0].tolist() == [[0, 2], [3, 5]]

@@ -75,18 +75,14 @@ def test_axes_are_taxels_and_many_values_are_drawn():
     assert possible.any(axis=1).sum() == 12 * level_check.MOST_VALUES
 
 
-def test_a_level_that_names_the_material_everywhere_is_counted():
-    """Across sessions too: the count; else no line."""
+def test_levels_are_blamed_on_a_session_only_if_it_sets_them():
+    """Everywhere: one line with the count; 75 % across sessions: no line."""
     sweeps = leveled(False)
     sweeps.groups["speed"] = sweeps.groups["recording"] % 2
     (line,) = level_check.warnings_of(sweeps)
     assert "96 of 96" in line
     drawn = np.random.default_rng(2).uniform(0, 400, len(sweeps))
     assert level_check.warnings_of(with_levels(sweeps, drawn)) == []
-
-
-def test_a_level_that_helps_across_sessions_is_not_reported():
-    """100 % within and 75 % across: both matter."""
     sweeps = leveled(False)
     moved = 100 * sweeps.labels + 75 * (sweeps.groups["session"] == 2)
     assert not any(map(SESSIONS.fullmatch, level_check.warnings_of(with_levels(sweeps, moved))))
@@ -105,18 +101,14 @@ def test_sets_of_one_session_have_a_line_of_their_own():
     assert level_check.warnings_of(with_levels(one, drawn)) == []
 
 
-def test_recordings_stay_whole():
-    """Levels of their own would reveal windows: a line if recordings are unknown."""
+def test_recordings_stay_whole_and_chance_is_the_sessions():
+    """Levels of their own reveal windows; of two materials a session chance is 50 %."""
     sweeps = leveled(False, windows=6, sessions=1)
     own = np.random.default_rng(3).uniform(0, 400, (32, 1, 6, 6))[sweeps.groups["recording"]]
     noise = np.random.default_rng(4).normal(0, 4, (len(own), 6, 6, 6))
     mixed = replace(sweeps, samples=(own + noise).astype(np.int16))
     assert level_check.warnings_of(mixed) == []
     assert "one session" in level_check.warnings_of(replace(mixed, groups={}))[0]
-
-
-def test_answers_are_materials_of_the_session():
-    """Chance is 50 %; materials that never meet do not count."""
     whole = leveled(True, each=12, sessions=6)
     sweeps = whole.take((whole.labels - whole.groups["session"]) % 2 == 0)
     rank, turn = sweeps.labels // 2, sweeps.groups["session"] // 2

@@ -41,12 +41,16 @@ def threads(task: int) -> int:
     return max(entry["num_threads"] for entry in threadpoolctl.threadpool_info())
 
 
-def test_every_task_is_done_once_with_its_data():
-    """With two processes, each result comes with its task."""
+def test_every_task_is_done_once_in_one_thread():
+    """Each result comes with its task, and an error is raised here."""
     data = np.arange(50.0)
     done = dict(parallel.results(add, range(20), [data], jobs=2))
     assert done == {task: task + 1225.0 for task in range(20)}
     assert not list(parallel.results(add, [], [data]))
+    for jobs in (1, 2):
+        assert {n for _, n in parallel.results(threads, [0], [], jobs=jobs)} == {1}
+    with pytest.raises(IndexError):
+        list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
 
 
 def test_a_process_that_is_replaced_is_not_spoken_of():
@@ -61,18 +65,6 @@ def test_a_process_that_is_replaced_is_not_spoken_of():
         )
         warnings.warn("another", UserWarning, stacklevel=1)
     assert [str(one.message) for one in shown] == ["another"]
-
-
-def test_each_task_has_one_thread():
-    """Linear algebra has one thread, in this process and in others."""
-    for jobs in (1, 2):
-        assert {n for _, n in parallel.results(threads, [0], [], jobs=jobs)} == {1}
-
-
-def test_an_error_in_a_task_is_the_callers():
-    """The error of a task is raised here."""
-    with pytest.raises(IndexError):
-        list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
 
 
 @pytest.fixture(scope="module")

@@ -80,11 +80,15 @@ def test_a_rule_is_dropped_kept_or_forced(
     assert said.count("not needed") == len(out - set(asked.left_out))
 
 
-def test_a_rule_that_cannot_be_fitted_is_not_kept():
-    """The card does not claim it, although it was asked for."""
+def test_rules_are_kept_where_they_are_fitted_and_few_sweeps_judge():
+    """The card claims no other; few sweeps would decide by chance; none can be both."""
     figures = {"hum": {"kept": False, "because": "absent"}}
     made = packaged().manifest
     assert "kept" not in rules.text(replace(made, figures={rules.FIGURES: figures}))
+    few = sets.load(SWEEPS).take(np.arange(trial.EACH - 1))
+    assert trial.decided(packaged(), few, 0, Asked(left_out=("hum",)))[0] == ["hum"]
+    with pytest.raises(FormatError, match="hum"):
+        Asked(("hum",), ("taxels", "hum"))
 
 
 def test_of_two_rules_that_do_the_same_one_stays(monkeypatch: pytest.MonkeyPatch):
@@ -109,14 +113,6 @@ def test_rules_against_faults_stay_although_held_out_sweeps_are_clean(
     assert len({"slide", "vibration"} & set(found)) < 2
     right, fewer = figures["taxels"]["right"]
     assert fewer < right
-
-
-def test_few_sweeps_leave_all_rules_in_and_none_can_be_both():
-    """They would decide by chance; the message has the rule's name."""
-    few = sets.load(SWEEPS).take(np.arange(trial.EACH - 1))
-    assert trial.decided(packaged(), few, 0, Asked(left_out=("hum",)))[0] == ["hum"]
-    with pytest.raises(FormatError, match="hum"):
-        Asked(("hum",), ("taxels", "hum"))
 
 
 @pytest.mark.parametrize("kind", junk.JUNK)

@@ -60,13 +60,18 @@ def test_what_is_named_is_counted(classifier: Classifier):
     assert (found.right == ((labels == s.labels) & named)).all()
 
 
-def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):
-    """In another order; a material that the bundle lacks is listed with its answers."""
+def test_materials_go_by_name_and_forms_must_agree(classifier: Classifier):
+    """In another order; foreign ones are listed; both formats are named."""
     s = sweeps(*HERE, (0, 6), labels=[1, 0, 2, 2], materials="bax")
     found = bundle_score.score(classifier, s)
     assert found.right.tolist() == [True, True]
     assert found.foreign == {"x": Counter(c=2)}
     assert "not counted: c 2" in found.text()
+    s = sweeps(*HERE, labels=[0, 1, 2])
+    with pytest.raises(FormatError, match="2x2 int16"):
+        bundle_score.score(classifier, replace(s, rate_hz=50.0))
+    with pytest.raises(FormatError, match="x, y, z"):
+        bundle_score.score(classifier, replace(s, materials=tuple("xyz")))
 
 
 def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
@@ -78,15 +83,6 @@ def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
     assert found.by == "recording"
     assert "fused: 2 of 2" in found.text()
     assert bundle_score.score(classifier, sweeps(*HERE, labels=[0, 1, 2])).recordings is None
-
-
-def test_a_set_of_another_form_is_refused(classifier: Classifier):
-    """Both formats are named; so are the materials if none is the same."""
-    s = sweeps(*HERE, labels=[0, 1, 2])
-    with pytest.raises(FormatError, match="2x2 int16"):
-        bundle_score.score(classifier, replace(s, rate_hz=50.0))
-    with pytest.raises(FormatError, match="x, y, z"):
-        bundle_score.score(classifier, replace(s, materials=tuple("xyz")))
 
 
 def test_the_command_prints_and_writes_what_it_found(

@@ -13,8 +13,8 @@ def test_a_score_counts_with_the_papers_interval():
     assert interval(np.arange(60) < 55) == pytest.approx((0.819, 0.964), abs=5e-4)
 
 
-def test_sweeps_that_fail_together_widen_the_interval():
-    """Two of ten positions all wrong: wider than a pool's, never narrower than Wilson's."""
+def test_intervals_widen_with_groups_and_cover_the_truth():
+    """Two of ten positions wrong; of 200 experiments about 19 in 20."""
     position = np.repeat(np.arange(10), 50)
     right = position >= 2
     low, high = interval(right, position)
@@ -22,10 +22,6 @@ def test_sweeps_that_fail_together_widen_the_interval():
     assert low < pool_low - 0.1
     assert high > pool_high + 0.05
     assert interval(np.ones(90, bool), np.repeat(np.arange(9), 10)) == interval(np.ones(90, bool))
-
-
-def test_the_bootstrap_covers_the_truth():
-    """Of 200 experiments with 12 groups about 19 in 20 intervals hold the mean."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(200):
         p = rng.beta(8, 2, 12)

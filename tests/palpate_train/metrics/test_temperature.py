@@ -36,18 +36,14 @@ def test_evidence_is_needed_to_cool_a_head():
     )
 
 
-def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
-    """One of 300 wrong by 1: about half."""
+def test_one_wrong_sweep_or_group_asks_for_little():
+    """One of 300 wrong by 1: about half; evidence of one group of thirty does not count."""
     labels = np.arange(300) % 3
     logits = 30 * np.eye(3)[labels]
     logits[0] = [0, 1, 0]
     assert sufficient_temperature(logits, labels, np.arange(300) % 10) < 0.6 * platt_temperature(
         logits, labels
     )
-
-
-def test_sweeps_that_fail_together_count_as_one():
-    """Evidence of one group of thirty does not count, that of every group does."""
     labels = np.zeros(300, int)
     logits = np.tile([6.0, 0.0], (300, 1))
     logits[:10] = [0.0, 6.0]

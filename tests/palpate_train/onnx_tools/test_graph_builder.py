@@ -31,18 +31,14 @@ def drawn() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (5, 20, 2, 2), np.uint8)
 
 
-def test_what_both_compute_is_there_once():
-    """Six nodes are shared; the two nodes and the constant that differ get names of their own."""
+def test_joined_graphs_share_nodes_and_keep_their_bits():
+    """Six nodes once; each output equals its own graph's, the first is unchanged alone."""
     both = joined(made("a", 0.5), made("b", 0.25))
     names = "reshape0 cast1 reducesum2 reducesum3 reshape4  mul6 a mul6.b b"
     assert " ".join(node.name for node in both.graph.node) == names
     assert [node.output[:] for node in both.graph.node][5] == ["most", "who"]
     assert len(both.graph.initializer) == len(made("a", 0.5).graph.initializer) + 1
     assert [output.name for output in both.graph.output] == ["a", "b"]
-
-
-def test_outputs_of_joined_graphs_keep_their_bits():
-    """Each equals its own graph's; without the other the first graph is unchanged."""
     one, other = made("a", 0.5), made("b", 0.25)
     both = joined(one, other)
     for name, have in zip("ab", [run_output(both, name, drawn()) for name in "ab"], strict=True):

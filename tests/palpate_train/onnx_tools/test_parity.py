@@ -13,8 +13,8 @@ def booleans(n: int, wrong: list[int]) -> np.ndarray:
     return right
 
 
-def test_what_is_lost_is_counted_in_pairs():
-    """Three lost, one won, by hand; none lost in a hundred proves nothing."""
+def test_what_is_lost_is_counted_in_pairs_and_groups():
+    """Three lost, one won; all losses in one of five recordings widen the interval."""
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
     assert (lost.total, lost.float_right, lost.int8_right) == (50, 49, 47)
     assert lost.lost == pytest.approx(0.04)
@@ -24,6 +24,13 @@ def test_what_is_lost_is_counted_in_pairs():
     none = parity.loss(booleans(100, [4]), booleans(100, [4]))
     assert (none.lost, none.low) == (0, pytest.approx(-none.high))
     assert 0.01 < none.high < 0.03
+    wrong = booleans(50, list(range(5)))
+    alone, together = (
+        parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10)
+    )
+    assert together.low <= alone.low
+    assert together.high > alone.high
+    assert parity.loss(np.ones(50, bool), wrong, np.arange(50) // 10) == together
 
 
 def test_the_interval_holds_what_it_promises():
@@ -35,17 +42,6 @@ def test_the_interval_holds_what_it_promises():
         lost = parity.loss(np.isin(kind, (0, 2)), np.isin(kind, (1, 2)))
         held += lost.low <= 0.02 <= lost.high
     assert held >= 0.93 * 400
-
-
-def test_sweeps_that_fail_together_count_together():
-    """All losses in one of five recordings: a wider interval."""
-    wrong = booleans(50, list(range(5)))
-    alone, together = (
-        parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10)
-    )
-    assert together.low <= alone.low
-    assert together.high > alone.high
-    assert parity.loss(np.ones(50, bool), wrong, np.arange(50) // 10) == together
 
 
 def test_differences_by_hand():

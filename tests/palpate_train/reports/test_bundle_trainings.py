@@ -64,10 +64,15 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
     assert found["trained"]["method"] == "palpate"
 
 
-def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
-    """A fit with its own size gives the reason instead of figures."""
+def test_curves_need_a_method_and_the_form_of_the_bundle(tmp_path: Path):
+    """Else the reason stands in their place, before any training."""
     found = bundle_trainings.run({}, easy(4), easy(4), where(tmp_path), NOTHING)
     assert found.keys() == {"why_not"}
+    other: Dataset = tones()
+    with pytest.raises(FormatError, match=r"easy .* tones"):
+        bundle_trainings.run(
+            {"method": "static-svm"}, easy(4), other, Where(jobs=1, cache=None), NOTHING
+        )
 
 
 def test_materials_are_matched_by_name():
@@ -117,12 +122,3 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     assert isinstance(Fit.load(fit), Fit)
     assert main(["report", str(tmp_path / "t.npz"), *named[2:]]) == FormatError.exit_code
     assert "t.npz: not a fit" in capsys.readouterr().err
-
-
-def test_sets_for_training_must_have_the_form_of_the_bundle():
-    """A set of another skin is refused before any training."""
-    other: Dataset = tones()
-    with pytest.raises(FormatError, match=r"easy .* tones"):
-        bundle_trainings.run(
-            {"method": "static-svm"}, easy(4), other, Where(jobs=1, cache=None), NOTHING
-        )

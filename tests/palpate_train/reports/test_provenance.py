@@ -37,16 +37,12 @@ def written(folder: Path, about: Provenance) -> list[Path]:
     return [folder / name for name in texts]
 
 
-def test_each_kind_of_file_gives_its_header_back(tmp_path: Path):
-    """Names may contain tags, ends of comments and quotes."""
+def test_each_kind_of_file_has_one_header(tmp_path: Path):
+    """Names may hold tags and quotes; a second takes the place of the first."""
     for path in written(tmp_path, ABOUT):
         assert provenance.read(path) == ABOUT, path.name
     (tmp_path / "a.json").write_text(json.dumps({"commit": "abc", "bundle": "12345678", "seed": 3}))
     assert provenance.read(tmp_path / "a.json") == Provenance(("abc",), ("12345678",), (), (3,))
-
-
-def test_a_second_header_takes_the_place_of_the_first():
-    """The text beside the header stays."""
     other = replace(ABOUT, commit=("fff",), bundle=(score.shipped(),))
     assert provenance.in_svg(provenance.in_svg(SVG, ABOUT), other) == provenance.in_svg(SVG, other)
     page = "# Title\n\nText -- and <!-- a --> more.\n\n- line\n"
@@ -100,14 +96,18 @@ def test_the_header_is_collected_wherever_figures_say_it():
     ).bundle == ("33333333",)
 
 
-def test_a_run_records_its_origin():
-    """A run records the packaged bundle, the day and the commit; figures of today are not older."""
+def test_runs_and_pages_say_where_they_are_from():
+    """Bundle, day and commit; a link before the title, the origin at the end."""
     known = score.provenance()
     assert known["shipped"] == score.shipped()
     assert re.fullmatch(r"[0-9a-f]{8}", known["shipped"])
     assert re.fullmatch(r"20\d\d-\d\d-\d\d", known["date"])
     assert provenance.of({"method": "palpate"} | known).older == ""
     assert "default" in provenance.of({"method": "minirocket"} | known).older
+    page = as_html(ABOUT)
+    assert re.search(r"<nav><a .*README.*\n<h1>", page)
+    assert "bundle 12345678, seeds" in PageReader(page).text
+    assert "README" not in as_html(ABOUT, home="")
 
 
 def test_a_page_of_an_older_default_says_so_in_its_first_line():
@@ -125,14 +125,6 @@ def test_a_page_of_an_older_default_says_so_in_its_first_line():
     both = replace(ABOUT, bundle=("87654321", now))
     assert "in part" in both.older
     assert "bundle 87654321;" in both.older
-
-
-def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
-    """A link before the title, the origin at the end; no link on a page for others."""
-    page = as_html(ABOUT)
-    assert re.search(r"<nav><a .*README.*\n<h1>", page)
-    assert "bundle 12345678, seeds" in PageReader(page).text
-    assert "README" not in as_html(ABOUT, home="")
 
 
 def test_every_table_has_a_frame(tmp_path: Path):

@@ -56,11 +56,17 @@ def test_the_assessment_says_what_else_would_get_a_label():
     assert [*found.json()["others"].values()] == [[*of] for of in found.others.values()]
 
 
-def test_few_sweeps_are_not_enough_however_right_they_are():
-    """Nine right answers show little; the material with the fewest sweeps comes first."""
+def test_few_or_wrong_sweeps_ask_for_more():
+    """Nine right answers show little; the fewest, then the most errors come next."""
     found = answers(sure(0, 0, 0, 0, 1, 1, 1, 2, 2), [0, 0, 0, 0, 1, 1, 1, 2, 2])
     assert "9 sweeps are few" in found.advice()
     assert found.advice().endswith("of pine first")
+    labels = [0] * 10 + [1] * 10 + [2] * 10
+    named = list(labels)
+    named[0], named[1] = 1, 1
+    p = sure(*named)
+    p[:2] = [0.3, 0.6, 0.1]
+    assert answers(p, labels).advice().startswith("3 more of cork")
 
 
 def test_a_mislabelled_sweep_is_pointed_out():
@@ -85,16 +91,6 @@ def test_a_mislabelled_sweep_is_found_in_signals():
     found = assess(lesson(replace(sweeps, labels=labels)))
     assert [one.sweep for one in found.suspects()] == ["sweep-000003"]
     assert found.suspects()[0].looks_like == "low"
-
-
-def test_the_material_with_most_errors_comes_next():
-    """Errors of a material and sweeps of others that get its label both count."""
-    labels = [0] * 10 + [1] * 10 + [2] * 10
-    named = list(labels)
-    named[0], named[1] = 1, 1
-    p = sure(*named)
-    p[:2] = [0.3, 0.6, 0.1]
-    assert answers(p, labels).advice().startswith("3 more of cork")
 
 
 @pytest.mark.slow

@@ -184,14 +184,20 @@ def test_frames_inside_of_json_are_read(tmp_path: Path, content: bytes, note: st
     assert [note in said for said in found.notes] == [True] * bool(note)
 
 
-def test_one_of_several_lists_is_named(tmp_path: Path):
-    """Without --variable they have to be the columns of one table."""
+def test_lists_of_json_are_named_and_null_is_a_fault(tmp_path: Path):
+    """Without --variable they are columns of one table; null counts in a taxel alone."""
     both = {"left": SKIN.tolist(), "right": SKIN[:9].tolist()}
     (tmp_path / "a.json").write_text(json.dumps(both))
     found = raw_files.read(tmp_path / "a.json", ReadPlan("left"))
     np.testing.assert_array_equal(found.values, SKIN)
     with pytest.raises(FormatError, match="'left': 40, 'right': 9"):
         raw_files.read(tmp_path / "a.json")
+    rows = [{"a": 1, "b": 2}, {"a": None, "b": 3}, {"a": 1, "b": 3}]
+    (tmp_path / "a.jsonl").write_bytes(lines(*rows))
+    found = raw_files.read(tmp_path / "a.jsonl")
+    assert found.faults.keys() == {0}
+    assert "line 2, a is None" in found.faults[0]
+    assert found.values[:, 1].tolist() == [2, 3, 3]
 
 
 @pytest.mark.parametrize(
@@ -209,16 +215,6 @@ def test_bad_json_is_named(tmp_path: Path, content: bytes, why: str):
     with pytest.raises(FormatError) as e:
         raw_files.read(tmp_path / "a.jsonl")
     assert why in str(e.value)
-
-
-def test_null_in_json_is_a_fault(tmp_path: Path):
-    """It counts only if the column is a taxel."""
-    rows = [{"a": 1, "b": 2}, {"a": None, "b": 3}, {"a": 1, "b": 3}]
-    (tmp_path / "a.jsonl").write_bytes(lines(*rows))
-    found = raw_files.read(tmp_path / "a.jsonl")
-    assert found.faults.keys() == {0}
-    assert "line 2, a is None" in found.faults[0]
-    assert found.values[:, 1].tolist() == [2, 3, 3]
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
 
 
 def test_a_table_may_stand_anywhere_on_a_sheet(tmp_path: Path):
-    """Two columns and three rows further, with a remark beside two of its rows."""
+    """With remarks beside and rows above, which count; empty cells and errors are faults."""
     rows = [[], [], ["", "", "Recorded by Ada"], *[["", "", *row] for row in ROWS]]
     rows[7].append("touched")
     rows[9].append("let go")
@@ -80,10 +80,6 @@ def test_a_table_may_stand_anywhere_on_a_sheet(tmp_path: Path):
     empty, remarks = found.notes
     assert "2 columns" in empty
     assert "9" in remarks
-
-
-def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
-    """An empty cell and an error of a formula; rows above the table count."""
     rows = [["Recorded by Ada"], [], *[list(row) for row in ROWS]]
     rows[9][3] = None
     rows[12][4] = "#DIV/0!"

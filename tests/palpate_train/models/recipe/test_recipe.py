@@ -42,15 +42,11 @@ def fitted() -> Fit:
     return recipe.fit(easy(), Run(1), CLOSED)
 
 
-def test_an_easy_set_is_classified_correctly(fitted: Fit):
-    """The heads did not see the part; the description names the choice."""
+def test_an_easy_set_is_classified_correctly_by_a_fitting_trunk(fitted: Fit):
+    """Heads did not see the part; each feature is in a discriminant."""
     assert fitted.about["validation"]["accuracy"] > 0.9
     assert "filters" in fitted.about["chosen"] or "spectrum" in fitted.about["chosen"]
     assert len(fitted.train) + len(fitted.held) == len(easy())
-
-
-def test_the_trunk_holds_what_the_heads_see_and_no_more(fitted: Fit):
-    """Each feature is in a discriminant, and the heads fit the trunk."""
     columns = fitted.plan.columns()
     size = fitted.weights["int8.weight"].shape[1]
     assert columns.tolist() == list(range(size))
