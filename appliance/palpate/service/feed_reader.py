@@ -22,6 +22,9 @@ from palpate.core.types import Sweep
 QUEUE_BYTES = 768 * 1024
 """Most bytes that wait for one reader: a window of 640 kB as text, and other lines. Readers that
 stand still hold the same lines."""
+LINE_BYTES = 200
+"""What a line counts beside its bytes: some 60 for the object, and a place in each queue. Without
+it frames of minutes would wait, whose places in twenty queues take more than the frames."""
 HEARD_BYTES = 64
 """Bytes of requests that are read at once."""
 MOST_REQUEST = 1024
@@ -118,7 +121,7 @@ class Reader:
         self.connection = connection
         self.frames_hz, self.sweeps = 0.0, False
         self._queue: deque[bytes] = deque()
-        self._size = 0  # bytes in the queue
+        self._size = 0  # bytes in the queue, with LINE_BYTES each
         self._begun = 0  # bytes of the first line that were sent
         self._lost = 0  # lines that were dropped
         self._rest = b""
@@ -132,16 +135,15 @@ class Reader:
         """Queue a line. Where there is no room, the oldest lines are dropped, except one that was
         sent in part."""
         self._queue.append(line)
-        self._size += len(line)
+        self._size += len(line) + LINE_BYTES
         first = 1 if self._begun else 0
         while self._size > QUEUE_BYTES and len(self._queue) > first:
-            self._size -= len(self._queue[first])
-            del self._queue[first]
+            self._drop(first)
             self._lost += 1
 
     def put_window(self, line: bytes | None) -> None:
         """Queue a line if there is room, else count it as lost. None: it is too large for all."""
-        if line is None or self._size + len(line) > QUEUE_BYTES:
+        if line is None or self._size + len(line) + LINE_BYTES > QUEUE_BYTES:
             self._lost += 1
         else:
             self.put(line)
@@ -155,19 +157,19 @@ class Reader:
         lost = 0 if self._begun else self._lost
         if lost:
             self._queue.appendleft(encode("lost", {"lines": lost}))
-            self._size += len(self._queue[0])
+            self._size += len(self._queue[0]) + LINE_BYTES
         try:
             parts = islice(self._queue, 1, _PARTS)
             sent = self.connection.sendmsg([memoryview(self._queue[0])[self._begun :], *parts])
         except BlockingIOError:
             if lost:
-                self._drop_first()
+                self._drop(0)
             return
         self._lost -= lost
         self._begun += sent
         while self._queue and self._begun >= len(self._queue[0]):
             self._begun -= len(self._queue[0])
-            self._drop_first()
+            self._drop(0)
 
     def receive(self) -> list[FeedRequest]:
         """The requests that have come since the last call.
@@ -197,5 +199,6 @@ class Reader:
                 self.connection.send(encode("closed", {"why": why}))
         self.connection.close()
 
-    def _drop_first(self) -> None:
-        self._size -= len(self._queue.popleft())
+    def _drop(self, at: int) -> None:
+        self._size -= len(self._queue[at]) + LINE_BYTES
+        del self._queue[at]
