@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from palpate.bridges.options import FEED_KINDS, LINKS, MOST, PORTS, add_arguments
-from palpate.bridges.results import Results
 from palpate.bridges.server import TcpServer, address, stop_event, until
 from palpate.bridges.source import FeedSource, LineSource, LinkPort
 from palpate.client.box import Heard
@@ -176,6 +175,7 @@ def run_mqtt(args: argparse.Namespace) -> int:
     with _needed("the MQTT client", "mqtt"):
         from palpate.bridges import mqtt
         from palpate.bridges.mqtt_broker import broker
+        from palpate.bridges.results import Results
 
     settings = config.load(None)
     settle("mqtt", args, settings)

@@ -10,7 +10,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from palpate.client import verdicts
 from palpate.client.answers import Answer
 from palpate.core import wall_clock
 from palpate.core.errors import FeedError
@@ -26,18 +25,21 @@ class Results:
 
     def __init__(self, file: Path) -> None:
         self._file, self._began_s = file, wall_clock.seconds()
-        self._newest: deque[Mapping[str, Any]] = deque(maxlen=KEPT)
+        self._newest: deque[tuple[float, Answer]] = deque(maxlen=KEPT)
 
     def add(self, at_s: float, answer: Answer) -> None:
         """Keep a result. at_s: when it was heard, seconds since 1970."""
-        row = {name: getattr(answer, name) for name in verdicts.COLUMNS if name != "at"}
-        self._newest.append({"at": at_s, **row})
+        self._newest.append((at_s, answer))
 
     def since(self, from_s: float, most: int = MOST) -> list[Mapping[str, Any]]:
         """The first `most` results since this time, in order, with the columns of the file."""
+        from palpate.client import verdicts  # SQLite takes a MiB, and few clients ask
+
         newest = [*self._newest]
-        first_s = newest[0]["at"] if len(newest) == KEPT else self._began_s
+        first_s = newest[0][0] if len(newest) == KEPT else self._began_s
         if from_s < first_s:
             with suppress(FeedError):
                 return [*verdicts.since(self._file, from_s, most)]
-        return [*islice((row for row in newest if row["at"] >= from_s), most)]
+        names = [name for name in verdicts.COLUMNS if name != "at"]
+        found = islice((one for one in newest if one[0] >= from_s), most)
+        return [{"at": at, **{name: getattr(one, name) for name in names}} for at, one in found]

@@ -202,15 +202,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             self._made.append((self.destroy_service, service))
         return TransitionCallbackReturn.SUCCESS
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release the box."""
-        return self.let_go()
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release the box."""
-        return self.let_go()
-
-    def let_go(self) -> TransitionCallbackReturn:
+    def on_cleanup(self, state: LifecycleState | None = None) -> TransitionCallbackReturn:
         """Close the box's serial line or feed, and end everything that `on_configure` has begun."""
         if self._sweeps:
             self._sweeps.interrupt()
@@ -225,6 +217,8 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._made, self._shown = [], ()
         self._news.clear()
         return TransitionCallbackReturn.SUCCESS
+
+    on_shutdown = on_cleanup
 
     def _sweep_action(self) -> SweepAction | None:
         """The action, if its messages are installed."""
@@ -323,7 +317,7 @@ def run(arguments: Sequence[str]) -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        node.let_go()
+        node.on_cleanup()
         executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()

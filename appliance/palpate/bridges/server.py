@@ -86,12 +86,10 @@ class TcpPeer:
 
 
 class TcpServer:
-    """Serves connections to `address`. peers: the open connections. refused: number of connections
-    that found it full."""
+    """Serves connections to `address`. peers: the open connections."""
 
     def __init__(self, serve: Serve, most: int) -> None:
         self.peers: set[TcpPeer] = set()
-        self.refused = 0
         self.address = ("", 0)
         self._serve, self._most = serve, most
 
@@ -119,7 +117,6 @@ class TcpServer:
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         now_s = asyncio.get_running_loop().time
         if not self._make_room(now_s()):
-            self.refused += 1
             writer.transport.abort()
             return
         connection = writer.get_extra_info("socket")

@@ -48,11 +48,6 @@ class TcpBridge:
         self._asked: dict[str, asyncio.Future[bytes]] = {}  # commands without an answer yet
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
-    @property
-    def trouble(self) -> str:
-        """The reason why the line is not open, "" if it is."""
-        return self._line.trouble
-
     def close(self) -> None:
         """Close the line."""
         self._line.close()

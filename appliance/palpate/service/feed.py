@@ -13,8 +13,8 @@ import select
 import socket
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +165,9 @@ class FeedServer(Observer):
         _clear(self._path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
-            with _umask(0o117):
-                listener.bind(os.fspath(self._path))
+            os.fchmod(listener.fileno(), 0o600)  # whatever the umask, nobody comes in before chmod
+            listener.bind(os.fspath(self._path))
+            self._path.chmod(0o660)
             listener.listen(MOST_READERS)
         except OSError:
             listener.close()
@@ -284,12 +285,3 @@ def _clear(path: Path) -> None:
     raise OSError(
         "another program offers its feed there; end it, or give this one a path of its own"
     )
-
-
-@contextmanager
-def _umask(mask: int) -> Iterator[None]:
-    before = os.umask(mask)
-    try:
-        yield
-    finally:
-        os.umask(before)

@@ -21,7 +21,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from heapq import merge
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 from weakref import WeakSet
 
 from palpate.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
@@ -91,14 +91,6 @@ an unknown path. It may wait for the disk."""
 Orders = Callable[[bytes, str], Future[Any]]
 """Takes an order of a browser with this role (access.ROLES) without waiting. Its future gives the
 answer for JSON, or an ApplianceError if the order is refused."""
-
-
-class State(Protocol):
-    """The content of a page with a single view."""
-
-    def json(self) -> dict[str, Any]:
-        """The content as JSON."""
-        ...
 
 
 class EventLog:
@@ -206,8 +198,8 @@ class PageServer:
         )  # an error belongs to the caller, not into the server's thread
         self._loop.call_soon_threadsafe(self._spread, name, content)
 
-    def show(self, view: State) -> None:
-        """Make `view` the newest event of this name."""
+    def show(self, view: Any) -> None:
+        """Make `view`, which has `json()`, the newest event of this name."""
         self.publish("view", view.json())
 
     def _spread(self, name: str, content: object) -> None:

@@ -122,15 +122,6 @@ def test_wrong_kinds_are_refused(path, value):
     file.close()
 
 
-def test_in_memory(tmp_path, monkeypatch):
-    """Without a file nothing is written to the folder of the program."""
-    monkeypatch.chdir(tmp_path)
-    file = VerdictFile(None)
-    file.add(NOW, verdict(1))
-    file.close()
-    assert [*tmp_path.iterdir()] == []
-
-
 def test_a_copy_during_writing(path, tmp_path):
     """With its -wal it has every verdict; without it the rest is sound."""
     file = VerdictFile(path)
