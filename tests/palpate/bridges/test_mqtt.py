@@ -150,6 +150,7 @@ def test_results_that_a_client_missed(server, box, tmp_path, monkeypatch):
     rows = VerdictFile(file)
     for number in range(1, 4):
         rows.add(began.timestamp() + number / 1e6, {"sweep": number, "status": "ok", "label": "x"})
+    rows.close()
     with Subscriber(server.port) as one, bridge("mqtt", *options(server, box)):
         online(box, one)
         for number, since in enumerate((began, datetime.now(UTC), None), 1):
