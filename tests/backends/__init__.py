@@ -1,8 +1,4 @@
-"""Backends: the layer below the drivers of the box. PALPATE_BACKEND selects one by name.
-
-tests/palpate/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink. It
-runs over every backend.
-"""
+"""Backends below the drivers: PALPATE_BACKEND selects one; contract: io/test_backends.py."""
 
 import os
 from collections.abc import Callable

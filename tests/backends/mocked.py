@@ -1,8 +1,4 @@
-"""umockdev as a backend: mocked device nodes below the real libusb, pyusb, libgpiod and gpiod.
-
-It needs a process under umockdev-wrapper, and runs in real time. It offers the skins of `skins`, a
-GPIO chip and a pseudo-terminal.
-"""
+"""umockdev as a backend, in real time, under umockdev-wrapper: skins, a GPIO chip, a port."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

@@ -1,8 +1,4 @@
-"""umockdev for backends: mocked devices, whose handlers run in one thread.
-
-They answer open, read and ioctl of this process. It needs `umockdev-wrapper` around the process,
-and Debian's python3-gi.
-"""
+"""umockdev for backends: handlers in one thread answer open, read and ioctl of this process."""
 
 import ctypes
 import os

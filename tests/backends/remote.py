@@ -57,10 +57,7 @@ def _unpack(value: Any) -> Any:
 
 
 class Asker:
-    """The guest's end of the connection.
-
-    Raises TimeoutError without an answer, AssertionError if the control failed outside.
-    """
+    """The guest's end. Raises TimeoutError without an answer, AssertionError for a failure."""
 
     def __init__(self, file: int) -> None:
         self._file, self._one, self._rest = file, threading.Lock(), b""

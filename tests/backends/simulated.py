@@ -1,7 +1,4 @@
-"""The simulator as a backend: palpate.sim below the drivers, a clock that skips all waits.
-
-Its serial line is a pseudo-terminal.
-"""
+"""The simulator as a backend: a clock that skips waits, a pseudo-terminal as serial line."""
 
 import errno
 from collections.abc import Callable, Iterator

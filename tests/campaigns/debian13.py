@@ -52,8 +52,7 @@ def _make(root: Path) -> None:
 
 
 def _clone(source: Path) -> None:
-    """Check out the last commit. Files that it leaves as they are keep their times, so `make`
-    installs again only what has changed."""
+    """Check out the last commit; unchanged files keep their times, so `make` installs little."""
     git = ("git", "-C", source)
     run("git", "init", "-q", source)
     run(*git, "fetch", "-q", "--depth", "1", f"file://{ROOT}", "HEAD")

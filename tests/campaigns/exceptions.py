@@ -152,8 +152,7 @@ class RobotPort:
 
 @dataclass(frozen=True, slots=True)
 class PlayedScene:
-    """A run: the call that raised, the expected number of answers, the answers, and how it
-    ended."""
+    """A run: the call that raised, the expected number of answers, the answers, the end."""
 
     thrown: str
     triggers: int

@@ -50,8 +50,7 @@ def drawn(count: int, seed: int = 0) -> Dataset:
 
 
 def peak(command: list[str]) -> tuple[float, float]:
-    """Peak memory in bytes that a command holds without mapped files, and its processor time in
-    seconds. The kernel keeps no peak of this memory, so it is read every PERIOD_S."""
+    """Peak memory in bytes without mapped files, read every PERIOD_S, and processor seconds."""
     most = 0.0
     with subprocess.Popen(command, stdout=sys.stderr) as process:
         while process.poll() is None:

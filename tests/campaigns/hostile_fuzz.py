@@ -113,8 +113,7 @@ def checked(model: bytes, own: Own) -> Bundle | None:
 
 
 def run(opened: Any, rng: Random) -> None:
-    """Run three sweeps: at rest, at the end of the scale, of noise. Raises FloatingPointError if a
-    classifier names a material without a probability."""
+    """Three sweeps: at rest, full scale, noise. FloatingPointError: a name without probability."""
     if isinstance(opened, Classifier):
         classify(opened, rng)
         return

@@ -50,8 +50,7 @@ def play(work: Path) -> Makes:
 
 
 def left(play: ScenePlay, call: str | None) -> list[tree.Tree]:
-    """The folders that a loss of power may leave before the first call of this name; None: at the
-    end."""
+    """The folders that a loss of power may leave before the first such call; None: at the end."""
     return next(
         list(m.disk.left()) for m in play.moments() if (m.call.name if m.call else None) == call
     )

@@ -153,8 +153,7 @@ def test_a_bundle_says_the_same_on_every_machine(
 def test_whole_answers_are_the_same_or_the_self_test_fails(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
-    """Status, label and reason, which numpy computes beside the network. numpy 2.3.5 multiplies
-    float32 matrices wrongly on an Arm with SME: there the box refuses the bundle at its start."""
+    """numpy 2.3.5 multiplies float32 wrongly on an Arm with SME."""
     name, there_result = there
     for what in here:
         if what.endswith("/answers"):

@@ -1,6 +1,1 @@
-"""Cuts: the contents of the disk after a program is killed, or after the power fails, at any
-moment.
-
-`python -m tests.cuts` runs the whole campaign; tests/campaigns/test_cuts.py runs a small part of
-it.
-"""
+"""The disk after a kill or a loss of power at any moment: `python -m tests.cuts`."""

@@ -117,16 +117,14 @@ def run(
 
 
 def output(call: SystemCall) -> str:
-    """The bytes that this call writes to standard output or standard error; children do not
-    count."""
+    """The bytes that this call writes to standard output or error, without children."""
     if call.process or call.name not in ("write", "writev") or call.descriptor not in (1, 2):
         return ""
     return call.data[: call.result or 0].decode("utf-8", "replace")
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
-    """The calls in the order of their ends; last those in which the process was killed. A call
-    whose name was not seen is left out: it has not ended. Raises NotFollowed."""
+    """The calls in the order of their ends, killed ones last. Raises NotFollowed."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
     parsed = [call for call in map(_parsed, _joined(lines)) if not call[1].startswith(UNSEEN)]
@@ -173,8 +171,7 @@ def _joined(lines: list[str]) -> Iterator[str]:
 
 
 def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], bytes]:
-    """Paths and data among the arguments of a call. A path is relative to the descriptor before it,
-    or to `folder`."""
+    """Paths, relative to the descriptor before or to `folder`, and data of a call."""
     paths: list[str] = []
     data, base = b"", folder
     of_data = name.startswith(("write", "pwrite"))

@@ -62,8 +62,7 @@ it syncs nothing."""
 
 @dataclass(frozen=True, slots=True)
 class Shop:
-    """A folder beside the box with its deliveries: bundles with these NAMES and rising counters,
-    signed by one key. It also holds this box's key for enrolments."""
+    """A folder with deliveries: bundles of NAMES, rising counters, one key; and the box's key."""
 
     folder: Path
 

@@ -271,8 +271,7 @@ class Disk:
                     yield found
 
     def _happened(self) -> list[tuple[Change, ...]]:
-        """Each set of unsynced changes that may have reached the disk: a change needs all earlier
-        changes that share a folder with it."""
+        """Each set of changes on the disk: with all earlier ones that share a folder."""
         sets: list[tuple[int, ...]] = [()]
         for i, change in enumerate(self._open):
             folders = {id(folder) for folder, _, _ in change}

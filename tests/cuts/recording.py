@@ -50,8 +50,7 @@ Files = Mapping[Path, bytes]
 
 
 def record(way: str, folder: Path, session: str) -> None:
-    """Record two sweeps, discard the second, record a third, rename and forget the material. way:
-    how the files are written."""
+    """Two sweeps, one discarded, a third, rename and forget. way: how files are written."""
     storage.put_all = lambda files, **how: WAYS[way](files)
     disk = DiskThread() if way == THREAD else AtOnce()
     running = recording(
@@ -181,8 +180,7 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def reported(output: str) -> tuple[dict[str, str], dict[str, str], set[str]]:
-    """Session and number of the stored sweeps, and of the discarded; in neither meanwhile. The
-    forgotten sweeps."""
+    """Session and number of stored and of discarded sweeps; the forgotten ones."""
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
     forgotten: set[str] = set()

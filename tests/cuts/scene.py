@@ -41,8 +41,7 @@ def stage() -> TemporaryDirectory[str]:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The judge's input: the folder, which it may change; the command that was cut; the output that
-    it asked for."""
+    """The judge's input: the folder, the command that was cut, the output asked for."""
 
     folder: Path
     step: str
@@ -51,8 +50,7 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class SceneStep:
-    """A command for a given folder. code: its exit code, None for any. killed: the call at which it
-    is killed. ahead: number of calls of that name with which its thread begins."""
+    """A command for a folder; its exit code; `killed` at a call, `ahead` such calls first."""
 
     name: str
     command: Callable[[Path], Sequence[str | Path]]
@@ -186,8 +184,7 @@ class ScenePlay:
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
-        """The command is killed there and started again in the same folder; at each moment of this
-        second run the power fails. Raises NotFollowed."""
+        """Killed, started again, and without power at each moment. Raises NotFollowed."""
         step, before = self.scene.steps[moment.step], self.before[moment.step]
         steps = step.cut(moment.call, self.runs[moment.step]), replace(step, code=None)
         twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
@@ -202,8 +199,7 @@ class ScenePlay:
         return self._point("kill_then_power", moment, states, wrong)
 
     def _run(self, step: SceneStep) -> TracedRun:
-        """Run a command, and compare the folder that it leaves with the modelled effect of its
-        calls."""
+        """Run a command and compare the folder that it leaves with the model's."""
         disk = Disk(self.folder, tree.read(self.folder))
         run = calls.run(step.arguments(self.folder), self.work / "log", step.killed, ENVIRONMENT)
         disk.follow(run.calls)

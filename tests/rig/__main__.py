@@ -1,8 +1,4 @@
-"""`python -m tests.rig build|show`: builds the virtual box, or shows it at work.
-
-`ground` builds the part that is the same for every commit, and `lacking` lists the Debian packages
-that are missing on this machine.
-"""
+"""`python -m tests.rig build|show|ground|lacking`: builds or shows the virtual box."""
 
 import argparse
 import sys

@@ -37,8 +37,7 @@ ANSWER_S = 30
 
 @dataclass(slots=True)
 class Touch:
-    """One sweep of the robot. start_ns, stop_ns: times of its edges. played: set once the board has
-    reached it."""
+    """One sweep of the robot: times of its edges; `played` once the board has reached it."""
 
     act: rig.Act
     start: bool = True
@@ -93,8 +92,7 @@ class Cell:
         return rig.ReadoutBoard(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
     def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard:
-        """Plug in `board`, by default a working board. A board that was plugged in is removed
-        first, and a running box has reported FAULT before this goes on."""
+        """Plug in `board` or a working one; the earlier goes first, with FAULT of a running box."""
         board = board or self.board()
         if self.cable.board:
             self.unplug()
@@ -154,8 +152,7 @@ class Cell:
         return self.machine.run(f"journalctl -u palpate -n {lines} -o cat --no-pager").out
 
     def restore(self) -> None:
-        """Return to normal: lines low, cable and port working, a working skin; wait until the box
-        is READY."""
+        """Lines low, cable, port and skin working; wait until the box is READY."""
         for name in ("START", "STOP"):
             self.lines.set(name, False)
         self.cable.mangle, self.cable.slow_s = bytes, 0.0

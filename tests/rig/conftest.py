@@ -1,6 +1,4 @@
-"""Fixtures of the tests on the virtual box. PALPATE_RIG=quick runs them, =full runs them with the
-counts of the report; otherwise they are skipped. `python -m tests.campaigns test-rig` sets it, and
-builds the box first."""
+"""Fixtures on the virtual box; PALPATE_RIG=quick or full, by `tests.campaigns test-rig`."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Support for tests that run inside the guest: a folder for its second disk, and controls outside
-that such tests can request (tests/backends/remote.py)."""
+"""Tests inside the guest: a folder for its second disk, and controls outside."""
 
 import shutil
 from collections.abc import Iterable

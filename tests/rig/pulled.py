@@ -1,5 +1,4 @@
-"""The skin's cable, pulled at a moment of a sweep. Each function takes a cell and the number of the
-attempt, and returns the status of the only answer."""
+"""The skin's cable pulled at a moment of a sweep; returns the only answer's status."""
 
 from tests.rig.cell import Cell
 from tests.rig.sound import begin, let_go, not_wrong, only_answer

@@ -1,5 +1,4 @@
-"""QEMU's qtest socket: sends commands of its protocol, returns the answers, and reports changes of
-intercepted outputs."""
+"""QEMU's qtest socket: commands, answers, and changes of intercepted outputs."""
 
 import queue
 import socket

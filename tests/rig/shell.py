@@ -1,5 +1,4 @@
-"""Shell commands in the guest, run from outside through the port at which its agent listens
-(guest/agent.py)."""
+"""Shell commands in the guest, from outside through the port of its agent."""
 
 import base64
 import json
@@ -27,8 +26,7 @@ class Done:
 
 
 class Shell:
-    """Runs one command at a time. An answer that comes too late is skipped, and not mistaken for
-    the answer to the next command."""
+    """One command at a time; an answer that comes too late is skipped."""
 
     def __init__(self, port: socket.socket, clock: GuestClock) -> None:
         self._port, self._clock = port, clock

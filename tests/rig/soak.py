@@ -189,10 +189,7 @@ def soak(name: str, seed: int, hours: float, work: Path) -> None:
 
 
 def summed(work: Path, out: Path) -> bool:
-    """Check the records against the targets, and write the results; False if a target was missed.
-
-    out: the file of results. A box without a record in `work` keeps its record in `out`.
-    """
+    """Check records, write results to `out`; False below a target. Old boxes keep theirs."""
     records = list(json.loads(out.read_text())["boxes"].values()) if out.exists() else []
     records += [json.loads(path.read_text()) for path in sorted(work.glob("*.json")) if path != out]
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}

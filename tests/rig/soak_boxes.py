@@ -92,8 +92,7 @@ class Script:
 
 
 def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
-    """RSS and PSS in KiB, processor seconds, open files and threads, from the texts of
-    /proc/PID/smaps_rollup and /proc/PID/stat."""
+    """RSS, PSS in KiB, processor seconds, files, threads, from texts of /proc/PID."""
     kib = dict(SMAPS.findall(smaps))
     fields = stat.rpartition(")")[2].split()
     cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
@@ -121,8 +120,7 @@ class Reckoned:
             self._board_s = at_s - frames / skin.FORMAT.rate_hz if frames else 0.0
 
     def _begin(self, origin_s: float) -> None:
-        """The script began at this time or earlier. Only small corrections are accepted: the first
-        answer may be slow, but an answer with a wrong number must not shift the script."""
+        """The script began then or before; a wrong number in an answer must not shift it."""
         if not self._origin_s or 0 < self._origin_s - origin_s < SLOW_ANSWER_S:
             self._origin_s = origin_s
 
@@ -138,10 +136,7 @@ class Reckoned:
 
 
 class ThisMachine:
-    """`palpate run --sim skin`, as installed beside this Python, in real time.
-
-    before: a command that starts it, such as `chrt -f 10`. sets: further settings.
-    """
+    """`palpate run --sim skin` beside this Python. before: a prefix. sets: settings."""
 
     name = "this machine"
 

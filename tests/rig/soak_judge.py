@@ -1,8 +1,4 @@
-"""Judges a soak: computes sums with intervals from the record of a box, and compares them with the
-targets.
-
-Nothing is read, started or timed here, so an invented record is judged like a real record.
-"""
+"""Judges a soak: sums with intervals from a record, against the targets; reads nothing."""
 
 import math
 from collections import Counter
@@ -129,8 +125,7 @@ def share(n: int, total: int) -> dict[str, Any]:
 
 
 def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
-    """Seconds of the answers, and the expected number of wrong answers up to each: 95 % of a
-    binomial with the error rate of the same bundle by itself on the script's own frames."""
+    """Seconds of the answers, and expected wrong answers: 95 % of the bundle's own binomial."""
     rows = [row for row in rows if row[3] != Status.ABORTED]
     alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, but not a refusal
     rate = sum(alone) / len(rows) if rows else 0.0

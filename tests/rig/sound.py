@@ -1,8 +1,4 @@
-"""Checks around a fault: the box recovers by itself, and no answer names a material that was not
-touched.
-
-A failed check raises AssertionError with the log of the box.
-"""
+"""Checks around a fault, with the box's log: it recovers, and names no other material."""
 
 from collections.abc import Iterable, Iterator
 
@@ -81,8 +77,7 @@ def until_state(cell: Cell, wanted: str) -> None:
 
 
 def begin(cell: Cell) -> tuple[Touch, int]:
-    """Open a sweep; returns it with the number of lines received before. Repeats the attempt if the
-    box was busy when the start edge came. Raises AssertionError if no sweep opens."""
+    """Open a sweep, again if the box was busy; the sweep and the number of lines before."""
     for _ in range(TRIES):
         since = len(cell.serial.heard)
         touch = cell.touch()

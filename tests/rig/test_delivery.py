@@ -148,9 +148,7 @@ def sound(box: BareBox) -> None:
 
 
 def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
-    """A bare board is installed, takes a bundle on trial, loses power in the trial and goes on with
-    it; a bundle with which the program dies at each start is left without help, and `palpate
-    rollback` goes back by hand."""
+    """Installed, on trial through a loss of power; crashes and `palpate rollback`."""
     box = BareBox(ground(), tmp_path)
     with box.on() as cell:
         box.prepare(cell)

@@ -1,8 +1,4 @@
-"""Effects of the trigger lines on the box, on a real kernel: edges that no correct robot sends get
-one answer each.
-
-Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
-"""
+"""Trigger lines on a real kernel: edges of no correct robot get one answer each."""
 
 from collections import Counter
 from collections.abc import Iterator

@@ -1,8 +1,4 @@
-"""Effects of the serial line on the box, on a real kernel: a robot that does not read, sends noise
-or disappears, a port that disappears, another program on it.
-
-Sentences resume without help, and until then sweeps are answered on the lines.
-"""
+"""The serial line on a real kernel: noise, no reader, no port, another program."""
 
 from pathlib import Path
 

@@ -151,9 +151,7 @@ def test_check_finds_it_through_the_kernels_driver(cell: Cell):
 
 
 def test_recorded_through_a_replug(cell: Cell, note: Note):
-    """`palpate record` without a bundle: the open sweep is answered sensor-lost, later ones are
-    taken, nothing is owed. The last test of this guest: the service goes on recording.
-    """
+    """sensor-lost, later sweeps are taken; last: it goes on recording."""
     runs_with(cell.machine, f"record --material cork --position a --out {SWEEPS}")
     cell.machine.run("systemctl restart --no-block palpate", check=True)
     assert cell.lines.wait("READY", False, SEEN_S)

@@ -109,8 +109,7 @@ def kept(cell: Cell, number: int, folder: Path) -> Sweep:
 
 
 def errors(sweep: Sweep, board: rig.ReadoutBoard, offset: Offset) -> tuple[float, float]:
-    """(ns by which the box's stamp of the window's middle frame is later than the truth, ns by
-    which that frame was truly taken after the middle of the edges)."""
+    """(ns of the box's stamp after the truth, ns of that frame after the edges' middle)."""
     half = len(sweep.frames) // 2
     taken_ns = board.frame_ns(int(sweep.frames.seq[half]) & ((1 << EPOCH_BITS) - 1))
     middle_ns = (sweep.start_ns + sweep.stop_ns) / 2 + offset.ns
@@ -139,9 +138,7 @@ def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
 def test_windows_lie_in_the_middle(
     cell: Cell, clock: KernelClock, note: Note, tmp_path: Path, what: str
 ):
-    """The window's middle is the frame taken half-way between the edges: within one frame at 80
-    ppm; beyond the drift that the box considers possible, within the resulting uncertainty. All
-    stamps are late by the shortest time of a transfer."""
+    """Within a frame at 80 ppm, beyond it within the uncertainty."""
     ppm, seen = CASES[what], []
     for _ in range(ATTEMPTS):
         board = cell.plug(cell.board(ppm=ppm, latency=spikes(abs(ppm))))

@@ -1,8 +1,4 @@
-"""The skin's cable pulled and plugged in at any moment, other boards on it, and resets.
-
-Nothing may hang, no answer may name a material that was not touched, and a working skin is used
-again without help.
-"""
+"""The skin's cable pulled and plugged in at any moment, other boards, resets."""
 
 import socket
 from collections import Counter

@@ -1,8 +1,4 @@
-"""A skin that sends invalid data, or does not answer as it should, and the outcome of each fault.
-
-The answer to an affected sweep says so; an unaffected sweep is answered right; a working skin is
-used again without help.
-"""
+"""A skin with invalid data or wrong replies: the answers say so, others are right."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -1,8 +1,4 @@
-"""Devices with false descriptors under the skin's ids: none is mistaken for a skin.
-
-The kernel refuses some, libusb or the box others. The service neither dies nor hangs, and the
-working skin streams afterwards.
-"""
+"""Devices with false descriptors under the skin's ids: none is mistaken for a skin."""
 
 import struct
 from dataclasses import dataclass

@@ -99,8 +99,7 @@ def send(one: socket.socket, data: bytes) -> bool:
 
 
 def peer(address: Address, goes_on: Callable[[socket.socket], bool], opening: bytes = b"") -> Act:
-    """A program with one connection, on which it first sends `opening`. It connects again once
-    `goes_on`, called in each round, has returned False or raised OSError."""
+    """A connection that first sends `opening`, and again once `goes_on` is False or raises."""
     held: list[socket.socket] = []
 
     def act() -> None:

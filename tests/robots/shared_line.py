@@ -1,8 +1,4 @@
-"""A box whose serial line is read here and by a bridge.
-
-The box's sentences are first read and timed here, with real-time priority if that is allowed, and
-then passed on. So a box with a bridge on its line is measured like a box without.
-"""
+"""A box whose line is read and timed here first, and then passed on to a bridge."""
 
 import os
 import select

@@ -105,8 +105,7 @@ class LatencyListener:
 
 @dataclass
 class BoxSide:
-    """One of the two boxes, and its measurements. looks: (seconds, processor seconds, KiB
-    resident)."""
+    """One of the two boxes. looks: (seconds, processor seconds, KiB resident)."""
 
     box: ThisMachine
     listener: LatencyListener

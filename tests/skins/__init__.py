@@ -1,2 +1,1 @@
-"""Measured on emulated skins: how often a bad cable makes a wrong frame, the load of each skin on
-the box, the whole way from recording to answers."""
+"""Measured on emulated skins: wrong frames of bad cables, load, the way to answers."""

@@ -1,5 +1,4 @@
-"""The skins that are measured: the profile, the emulator and numbered frames of a delivered
-profile."""
+"""The skins that are measured: profile, emulator and numbered frames."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -39,11 +38,7 @@ class Subject:
 
 @lru_cache
 def subject(name: str, rows: int = 0, cols: int = 0, n: int = 251) -> Subject:
-    """The skin with this name. Its numbers fill the range of the type, so every marker occurs among
-    them.
-
-    rows, cols: the grid on the wire, by default the profile's.
-    """
+    """The skin of this name; its numbers fill the type, so markers occur. rows, cols: the grid."""
     profile = skin_profile.load(name, [PROFILES])
     profile = replace(profile, rows=rows or profile.rows, cols=cols or profile.cols)
     format, rng = profile.format, np.random.default_rng(sum(name.encode()))

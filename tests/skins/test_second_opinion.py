@@ -1,8 +1,4 @@
-"""The makers' and users' own packages read the emulated skins: they see the frames that were
-played.
-
-The packages block while nothing comes, so each runs in a process of its own that is given a minute.
-"""
+"""The makers' and users' own packages read the emulated skins, a process each."""
 
 import json
 import subprocess

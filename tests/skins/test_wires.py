@@ -1,5 +1,4 @@
-"""The bytes of the emulated skins, compared with bytes put together by hand from the published
-layouts. None of the skins was available."""
+"""The bytes of the emulated skins against bytes put together by hand from layouts."""
 
 import numpy as np
 

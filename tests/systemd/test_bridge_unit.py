@@ -81,8 +81,7 @@ def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridge
 
 
 def test_the_line_over_tcp(machine: Machine, bridges: Service):
-    """The box opens the line that the bridge makes, another user does not; commands are refused
-    until a setting allows them; a killed bridge, and a killed service, find one another again."""
+    """The box opens it, commands need a setting; killed ones meet again."""
     settings = f'[serial]\nport = "{LINE}"\n[trigger]\nmode = "serial"\n'
     machine.put(SITE, settings)
     bridges.start()

@@ -142,8 +142,7 @@ def test_the_same_package_again_changes_nothing(host: hosts.Host):
 def test_make_install_takes_over_the_release_of_the_package(
     site: hosts.Hosts, host: hosts.Host, wheels: list[Path]
 ):
-    """With a host's name alone: the release is the same, so nothing is built or restarted; the
-    signer that the box lacks is made on the desktop, with its key."""
+    """Nothing is built; a signer is made."""
     pid = host.service["MainPID"]
     box, train = wheels
     at = ("--host", f"{hosts.USER}@{host.address}", "--wheel", box, "--teaching", train)
@@ -161,8 +160,7 @@ def test_make_install_takes_over_the_release_of_the_package(
 
 
 def test_the_installed_box_is_taught(host: hosts.Host):
-    """The libraries of palpate[teach] are there: simulated sweeps of two materials become a bundle
-    that the box's key has signed. The unit of the page starts, and the service after it."""
+    """Sweeps of two materials become a bundle of the box's key."""
     host.machine.get("install", "-d", "-o", "palpate", "/var/lib/palpate/simulated")
     for material in ("wood", "metal"):
         words = ("--label", material, "--sim", f"skin:{material}", "--virtual", "--sweeps", "4")

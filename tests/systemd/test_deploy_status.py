@@ -21,8 +21,7 @@ print(json.dumps([runs, AnsweringBox.asked, deploy.MOST_STATUS]))
 
 
 def asked(answer: str) -> tuple[bool, list[list[str]], int]:
-    """The verdict of deploy about the running bundle for this answer of a box, the commands with
-    their users, and the largest status that it reads."""
+    """Deploy's verdict for a box's answer, its commands with users, the largest status."""
     runs, commands, most = json.loads(run_here(ASK.format(answer=answer, sha=SHA)))
     return runs, commands, most
 

@@ -111,8 +111,7 @@ def test_the_unit_of_teaching_is_sound_and_limited(machine: Machine, before: lis
 
 
 def test_a_box_that_has_to_be_taught_shows_its_page(machine: Machine, service: Service):
-    """The file of the service starts the unit of the page, which takes its place and the file.
-    After Finish, and if there can be no page, the service is back."""
+    """In the service's place, which is back after it."""
     dropin = "/run/systemd/system/palpate-teach.service.d/test.conf"
     service.start()
     for end, after in (

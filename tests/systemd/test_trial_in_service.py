@@ -1,8 +1,4 @@
-"""A new bundle under a real systemd: its trial, the events that end it or not, and the shadow of a
-candidate.
-
-Bundle A is deployed and committed; each test deploys another, B, signed and with a higher counter.
-"""
+"""A new bundle (B after A) under a real systemd: its trial, and a candidate's shadow."""
 
 import base64
 import hashlib
@@ -261,9 +257,7 @@ def wait_for(done: Callable[[], bool], service: Service) -> None:
 def test_a_candidate_classifies_beside_and_becomes_the_one(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """Deployed as a candidate, it classifies in the shadow from the next start on; `palpate status`
-    and `palpate bundles` show its figures; once promoted it is on trial, and no longer in the
-    shadow."""
+    """In the shadow, shown; promoted on trial."""
     new = store.deploy("--shadow")
     assert store.current == store.a
     service.start(RUN)

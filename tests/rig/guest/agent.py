@@ -1,7 +1,4 @@
-"""In the guest: runs shell lines that arrive at a virtio port. One JSON line in, one out.
-
-In: {"run": "...", "timeout_s": 30}. Out: {"rc": 0, "out": "..."}; rc 124 where the time was up.
-"""
+"""Runs shell lines from a virtio port: {"run", "timeout_s"} to {"rc", "out"}; 124: time up."""
 
 import base64
 import json
