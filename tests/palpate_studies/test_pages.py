@@ -79,15 +79,11 @@ def test_a_page_shows_the_figures_of_its_results(drawn: Path, study: str):
     assert [fact for fact in facts(study) if fact not in text] == []
 
 
-def test_an_unknown_page_is_an_error(tmp_path: Path):
-    """Nothing is written then."""
+def test_a_page_links_to_its_results_and_an_unknown_one_is_an_error(tmp_path: Path):
+    """They lie beside it; nothing is written for an unknown one."""
     with pytest.raises(FormatError, match="nobody"):
         pages.write(["nobody"], tmp_path / "out", RESULTS)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_page_links_to_its_results(tmp_path: Path):
-    """They lie beside it."""
     page = published("stress", stress_data.figures(), tmp_path)
     assert json.loads((page.parent / "stress.json").read_text())["test_sweeps"] == 100
     assert "stress.json" in PageReader(page.read_text()).links

@@ -66,8 +66,8 @@ def test_printed_numbers_are_the_papers():
     assert np.allclose(paper_values.CONFUSION.sum(1), 1, atol=0.011)
 
 
-def test_objects_begin_with_every_sweep_once_and_mix_nothing():
-    """Sweeps of an object differ, are of one material and position, as many as there are."""
+def test_objects_are_fused_of_their_own_sweeps():
+    """Each begins one, of one place; two votes are the first's, a product can be better."""
     o = outcome("lopo", "H-svm")
     keep = np.arange(len(o.labels)) != 5
     labels, place = o.labels[keep], o.place[keep]
@@ -79,10 +79,6 @@ def test_objects_begin_with_every_sweep_once_and_mix_nothing():
     assert all(len(set(row)) == 3 for row in drawn.tolist())
     assert np.array_equal(drawn, paper_experiment.objects(labels, place, seed=1))
     assert not np.array_equal(drawn, paper_experiment.objects(labels, place, seed=2))
-
-
-def test_two_votes_give_what_the_first_gave_and_a_product_can_be_better():
-    """Half of the sweeps are correct with a high probability, half are narrowly wrong."""
     o = outcome("lopo", "H-svm", right=1)
     weak = np.arange(len(o.labels)) % 2 == 0
     o.logits[weak] = np.eye(6)[(o.labels[weak] + 1) % 6]

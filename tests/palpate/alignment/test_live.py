@@ -178,8 +178,16 @@ def test_align_with_what_is_simulated(which, want, tmp_path, default_bundle, cap
     assert any("centre" in text for text in lines)
 
 
-def test_another_skin_shape(model):
-    """A skin of 2 x 3 taxels with floating-point counts, some of them NaN."""
+def test_other_skins_are_looked_at_along_the_normal(model):
+    """With shear, which is not shown; of 2 x 3 taxels in floats, some of them NaN."""
+    world = skin.World(shear=True)
+    other = replace(model, manifest=replace(model.manifest, format=world.format))
+    script_of = script.named("rest", world.format, 1)[0]
+    seen = views_of(devices.build(world.format, script_of, rig.VirtualClock(), "sim"), other)(17)
+    assert states(seen)[-2:] == ["in-place", "no-contact"]
+    last = [v for v in seen if v.state == "in-place"][-4]
+    assert (last.shape, len(last.load), len(last.load[0])) == ((4, 4), 4, 4)
+    assert last.centre == pytest.approx((6, 6), abs=0.6)
     format = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
         model,
@@ -196,18 +204,6 @@ def test_another_skin_shape(model):
     seen = views_of(simulated, other)(3)
     assert re.match(r"2\.0 mm .*column 3", seen[-1].message)
     assert seen[-1].load[0][0] == 0
-
-
-def test_only_the_normal_axis_is_looked_at(model):
-    """A finger on the skin with shear is found at its position; shear is not shown."""
-    world = skin.World(shear=True)
-    other = replace(model, manifest=replace(model.manifest, format=world.format))
-    script_of = script.named("rest", world.format, 1)[0]
-    seen = views_of(devices.build(world.format, script_of, rig.VirtualClock(), "sim"), other)(17)
-    assert states(seen)[-2:] == ["in-place", "no-contact"]
-    last = [v for v in seen if v.state == "in-place"][-4]
-    assert (last.shape, len(last.load), len(last.load[0])) == ((4, 4), 4, 4)
-    assert last.centre == pytest.approx((6, 6), abs=0.6)
 
 
 VIEW = View(

@@ -21,8 +21,8 @@ def test_the_centre_of_a_contact_that_lies_on_the_skin(at):
         assert centre(counts(noisy), tare, 5.0) == pytest.approx(at, abs=0.15)
 
 
-def test_only_the_normal_axis_of_several_counts():
-    """Shear, however large, does not move the centre; the tare counts."""
+def test_the_normal_axis_and_the_nearest_position_count():
+    """Shear moves no centre; not the middle of positions, and the limit itself is within."""
     load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
     flat = counts(load + tare)
     shear = np.stack([500 * np.indices((4, 4))[0], -counts(load)[0]], axis=-1)
@@ -34,6 +34,10 @@ def test_only_the_normal_axis_of_several_counts():
         displacement(m, t, 5.0, MIDDLE).text for m, t in zip(means, (tares, tare), strict=True)
     ]
     assert moved[0] == moved[1] != ""
+    two = ContactPositions(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
+    assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
+    assert two.within((0.3, -0.4))
+    assert not two.within((0.3, -0.41))
 
 
 def test_loads_below_the_threshold_and_silent_taxels_have_no_weight():
@@ -92,11 +96,3 @@ def test_the_advice_follows_the_simulated_skin(along, axis, towards):
 def test_the_advice_names_direction_and_distance(offset, text):
     """The larger direction first; an insignificant one is left out."""
     assert advice(offset, (4, 5)) == text
-
-
-def test_the_nearest_position_counts():
-    """Distance is to the nearest position, not to their middle; the limit itself is within."""
-    two = ContactPositions(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
-    assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
-    assert two.within((0.3, -0.4))
-    assert not two.within((0.3, -0.41))

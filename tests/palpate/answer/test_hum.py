@@ -74,7 +74,7 @@ def test_other_frequencies_stay(hz):
 
 
 def test_hum_has_one_phase_on_all_taxels():
-    """Twelve of sixteen may be far louder; a ridge with another phase on each row is no hum."""
+    """Twelve of sixteen may be far louder; a ridge with another phase on each row stays."""
     given = sweep()
     given[:, 1:] = 100 + 8 * (given[:, 1:] - 100)
     assert HumFilter(FORMAT).ratio(counts(given + hum(counts=2))) > LIMIT

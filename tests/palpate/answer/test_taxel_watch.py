@@ -140,7 +140,7 @@ def test_a_bundle_without_the_figure_bridges_nothing(tmp_path, taxels, status):
 
 
 def test_windows_without_contact_or_with_too_many_broken_taxels_are_refused(run):
-    """A stuck taxel is no contact; also where they are sound now; sidecars of sound skins."""
+    """Stuck alone, or sound just now; sidecars of sound skins have no entry."""
     taxels = np.where(np.arange(100) % 2, 5, 0)[:, None, None] * np.ones((4, 4))
     taxels[:, 2, 2] = 90
     assert run(sweep_of(taxels.astype(np.int16))).status is Status.NO_CONTACT

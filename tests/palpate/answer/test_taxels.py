@@ -72,7 +72,7 @@ def test_a_constant_taxel_is_silent(place, count, named):
 
 
 def test_a_taxel_is_broken_by_one_axis_in_enough_frames_of_a_moving_skin():
-    """A constant shear axis is enough; LEAST_FRAMES show noise; at rest all may be constant."""
+    """Constant shear suffices; LEAST_FRAMES show noise; at rest all may be constant."""
     taxels = slide(axes=3)
     assert found(taxels) == ""
     taxels[:, 1, 1, 0] = 7

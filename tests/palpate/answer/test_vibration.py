@@ -19,7 +19,7 @@ def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
 
 
 def test_it_is_the_deviation_over_the_load_and_a_constant_part_rests():
-    """Whatever gain and shear; counts that are not numbers are refused elsewhere."""
+    """Whatever gain and shear; NaN is refused elsewhere."""
     want = [math.log(1 / 50), math.log(4 / 50)]
     assert vibration(window(1, 4), TARE, 2) == pytest.approx(want, abs=1e-3)
     strong = TARE + 10 * (window(1, 4) - TARE)

@@ -112,7 +112,6 @@ def test_bundles_are_compared_by_label_and_id(two):
 
 UNKNOWN = {**FAULT, "status": "unknown"}
 NO_CONTACT = {**FAULT, "status": "no-contact"}
-UNSURE = {"status": "unsure"}
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,18 @@ def test_canceled_when_the_answer_came(swept):
     assert swept.has_heard("START", "ABORT")
 
 
+def test_an_error_of_the_caller_leaves_no_sweep_open(swept):
+    """A `say` that fails ends the sweep at the box, too, and is not hidden."""
+
+    def fails(phase: str) -> None:
+        raise RuntimeError("no publisher")
+
+    swept.at_phase = fails
+    with pytest.raises(RuntimeError, match="publisher"):
+        swept.run()
+    assert swept.has_heard("START", "ABORT")
+
+
 def test_a_box_that_falls_silent(swept):
     """After 3.5 s without a sentence, anew with each; then the time limit ends the wait."""
     swept.use(Hurried())
@@ -231,18 +243,6 @@ def test_a_box_that_refuses_or_is_not_ready(swept, monkeypatch):
     with pytest.raises(NoAnswer, match="absent"):
         swept.run()
     assert swept.has_heard("START")
-
-
-def test_an_error_of_the_caller_leaves_no_sweep_open(swept):
-    """A `say` that fails ends the sweep at the box, too, and is not hidden."""
-
-    def fails(phase: str) -> None:
-        raise RuntimeError("no publisher")
-
-    swept.at_phase = fails
-    with pytest.raises(RuntimeError, match="publisher"):
-        swept.run()
-    assert swept.has_heard("START", "ABORT")
 
 
 def test_the_feed_begins_nothing(tmp_path):

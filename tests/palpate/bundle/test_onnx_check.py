@@ -138,7 +138,7 @@ def test_enrolled_labels_and_means_decide_as_well():
 
 
 def test_a_harmless_model_passes_and_one_that_lies_fails_its_trial():
-    """The graph around the hostile nodes is sound; the trial sees what comes out."""
+    """The graph around hostile nodes is sound; the trial sees real outputs."""
     one = bundle.load(bundle.DEFAULT)
     try_all(one)
     early = replace(one.manifest.early, least=(0.9,) * 3, limits=(1.0,) * 3)

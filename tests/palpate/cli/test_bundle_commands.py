@@ -39,16 +39,12 @@ def streaming(settings: Config, health: Health | None) -> object:
     return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
 
 
-def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings):
-    """Without a service, without a skin, or with a bundle from elsewhere, the format is unknown."""
+def test_a_bundle_for_another_skin_is_refused_with_both_formats(settings):
+    """Known by the bundle that runs; another window is accepted, any for an unknown skin."""
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
     assert streaming(settings, HEALTH._replace(skin="mismatch", streams=False)) is None
     assert streaming(settings, HEALTH._replace(bundle="9f3c2a1b")) is None
-
-
-def test_a_bundle_for_another_skin_is_refused_with_both_formats():
-    """Another window is accepted, and any for an unknown skin."""
     format = RUNNING.format
     other = replace(
         RUNNING,

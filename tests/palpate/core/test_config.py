@@ -158,16 +158,6 @@ def test_a_missing_board_lists_the_boards_there(folder, board):
             _load(folder, board)
 
 
-def test_a_line_with_two_meanings_is_refused(folder):
-    """Across layers and inside class_bits; the message has both roles and both sources."""
-    with pytest.raises(ConfigError) as e:
-        _load(folder, "a", "output.busy=L1")
-    for said in ("--set", "output.busy = 'L1'", "trigger.start", "board-a.toml"):
-        assert said in str(e.value)
-    with pytest.raises(ConfigError, match="class_bits"):
-        _load(folder, None, "output.class_bits=['X', 'X']")
-
-
 def test_files_that_cannot_be_read_are_named(folder):
     """A named site file that is missing, a folder at its path, and bytes that are not UTF-8."""
     with pytest.raises(ConfigError, match=r"other\.toml"):
@@ -302,10 +292,16 @@ def test_a_dead_program_is_not_ready(board):
         assert words in _page(board)
 
 
-def test_one_cable_fits_both_boards():
-    """The Raspberry Pi 4 and 5 files agree on every value."""
+def test_one_cable_fits_both_boards_and_a_line_one_role(folder):
+    """Raspberry Pi 4 and 5 agree on every value; both roles and sources are named."""
     four, five = map(_shipped, ("rpi4", "rpi5"))
     assert dataclasses.replace(four, board="rpi5") == five
+    with pytest.raises(ConfigError) as e:
+        _load(folder, "a", "output.busy=L1")
+    for said in ("--set", "output.busy = 'L1'", "trigger.start", "board-a.toml"):
+        assert said in str(e.value)
+    with pytest.raises(ConfigError, match="class_bits"):
+        _load(folder, None, "output.class_bits=['X', 'X']")
 
 
 def test_rules_and_unit_agree_with_the_settings():

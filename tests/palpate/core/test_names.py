@@ -51,16 +51,12 @@ def test_only_short_printed_texts_are_shown(text, can):
         assert names.can_be_shown(names.shown(text))
 
 
-def test_the_closest_names_are_proposed():
-    """The best one, or as many as are asked for, whatever their case; none that is too far."""
+def test_names_keep_labels_and_the_closest_are_proposed():
+    """Typed again the same; other scripts take no label; none that is too far."""
     known = ["max_sweeps", "max_sheets", "black_box"]
     assert closest("max_sweepz", known) == ["max_sweeps"]
     assert closest("MAX_SWEEPZ", known, 3) == ["max_sweeps", "max_sheets"]
     assert closest("zzz", known, 3) == []
-
-
-def test_names_keep_labels_and_take_none_of_the_bundle():
-    """Typed again the same; both forms of Unicode are one word, other scripts take no label."""
     known = TypedNames()
     known.add("Filz weiss", None)
     known.add("Holz", "Holz, geölt")

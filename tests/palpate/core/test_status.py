@@ -15,7 +15,7 @@ from tests.factories.paths import ROOT
 
 
 def test_all_that_is_said_of_a_status_is_of_the_table():
-    """PROTOCOL.md, page, Modbus, card: every status, in order, with words but for `ok`."""
+    """PROTOCOL.md, page, Modbus, card: each status, in order; all except `ok` have words."""
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
     listed = protocol.split("| status | meaning")[1].split("\n\n")[0]
     assert re.findall(r"(?m)^\| `([a-z-]+)` \|", listed) == [*Status]

@@ -11,7 +11,7 @@ from palpate.core import storage
 
 
 def test_folders_are_made_once_and_what_fails_is_said(tmp_path):
-    """With missing parents; a folder, a file in no folder, and the system's error."""
+    """With missing parents; a folder, a file in no folder, the system's own error."""
     for name in ("a", "b"):
         storage.put(tmp_path / "one" / "two" / name, name.encode(), parents=True)
     assert sorted(os.listdir(tmp_path / "one" / "two")) == ["a", "b"]

@@ -171,6 +171,17 @@ def test_nothing_is_written_while_nothing_is_new(box):
     assert before == (book.stat().st_mtime_ns, book.stat().st_ino)
 
 
+def test_another_command_is_not_waited_for(box, logged):
+    """The loop goes on, and the write is tried again later."""
+    trial = box.tried()
+    with box.store._locked():
+        trial.turn(health(0, streams=False))
+    assert box.standing.starts == 1
+    assert "use" in logged[-1]
+    trial.turn(health(11, streams=False))
+    assert box.standing.starts == 0
+
+
 def test_enough_sweeps_commit(box, logged):
     """Sweeps with a label, once none is open; older bundles are refused then."""
     trial = box.tried()
@@ -268,17 +279,6 @@ def test_a_full_disk_is_told_once_and_tried_again(box, monkeypatch, logged):
     assert "space" in logged[1]
     trial.turn(health(30))
     assert box.standing.committed
-
-
-def test_another_command_is_not_waited_for(box, logged):
-    """The loop goes on, and the write is tried again later."""
-    trial = box.tried()
-    with box.store._locked():
-        trial.turn(health(0, streams=False))
-    assert box.standing.starts == 1
-    assert "use" in logged[-1]
-    trial.turn(health(11, streams=False))
-    assert box.standing.starts == 0
 
 
 @pytest.mark.slow

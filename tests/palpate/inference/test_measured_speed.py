@@ -49,17 +49,13 @@ def concluded(it: Classifier, sweep: Sweep, probabilities: np.ndarray) -> Verdic
     return it.verdict(it.judged(sweep, told(it, probabilities)))
 
 
-def test_a_verdict_has_the_measured_slide(default_bundle):
-    """Speed and direction of the finger; the speed of START stands beside it unchanged."""
+def test_a_verdict_has_the_measured_slide_or_no_such_fields(default_bundle):
+    """Beside the speed of START; without pitch, at rest, early or refused none."""
     for speed in (1.0, 2.0):
         v = box(default_bundle)(slid(speed, speed_mm_s=99.0))
         assert v.measured_mm_s == pytest.approx(30 * speed, rel=0.03)
         assert (v.direction, v.speed_mm_s) == ("rows+", 99.0)
         assert v.as_dict()["measured_mm_s"] == v.measured_mm_s
-
-
-def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle):
-    """A bundle without a pitch, a finger that rests, an early answer, a refused sweep."""
     bare = replace(default_bundle.manifest, contact=None, displacement=None)
     resting = skin.sweep("wood", skin.Placement(), np.random.default_rng(1), rest_s=2, slide_s=0.1)
     half = slid(share=0.5)

@@ -33,16 +33,12 @@ def test_the_check_values_of_the_catalogue(name):
     assert NAMED[name].of(b"123456789") == CHECK[name]
 
 
-def test_a_negated_sum_makes_the_sum_of_all_bytes_zero():
-    """With its negated sum, the sum of all bytes is 0; an inverted one gives all ones."""
+def test_sums_and_parameters_describe_checksums():
+    """Negated all bytes sum to 0; polynomial, initial value, exclusive or."""
     data = b"\x12\xff\x80\x01"
     assert (sum(data) + NAMED["sum8-negated"].of(data)) & 0xFF == 0
     assert (sum(data) + NAMED["sum16-negated"].of(data)) & 0xFFFF == 0
     assert (sum(data) + NAMED["sum8-inverted"].of(data)) & 0xFF == 0xFF
-
-
-def test_parameters_describe_a_checksum_without_a_name():
-    """Polynomial, initial value and final exclusive or; other values are refused."""
     icode = Checksum("crc8", 0x1D, 0xFD)
     assert parsed("crc8 poly=1d init=fd xorout=00") == icode
     assert icode.of(b"123456789") == 0x7E  # CRC-8/I-CODE

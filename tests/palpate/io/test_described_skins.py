@@ -287,9 +287,6 @@ def test_types_of_values(kinds: str) -> None:
     assert found.taxels[0].ravel().tolist() == wanted
 
 
-ONE_BYTE = 'codec = "segments"\nmarker = "aa"\nskip_before = 1\n'
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

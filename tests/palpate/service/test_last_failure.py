@@ -26,21 +26,6 @@ def failed(folder: Path, clock: VirtualClock, error: Exception) -> Failure:
     return found
 
 
-def test_status_says_which_end_a_person_must_mend(tmp_path):
-    """Exit code 78 stays stopped until somebody acts; everything else is started again."""
-    clock = VirtualClock()
-    failed(tmp_path, clock, BundleError("golden sweeps differ"))
-    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
-    assert "78" in line
-    assert "stopped" in line
-    failed(tmp_path, clock, LineError("no chip"))
-    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
-    assert "69" in line
-    assert "started" in line
-    failed(tmp_path, clock, KeyError("a fault of the program"))
-    assert "KeyError" in status.read(tmp_path / "status.json", 0)["why"]
-
-
 def test_the_pause_grows_and_begins_anew(tmp_path):
     """Up to a limit; short after a minute's run or an order."""
     clock = VirtualClock()
@@ -65,11 +50,22 @@ def test_a_damaged_note_is_none(tmp_path, content):
     assert failed(tmp_path, VirtualClock(), LineError("no chip")).failures == 1
 
 
-def test_a_note_that_cannot_be_written_changes_nothing(tmp_path):
-    """The error itself is raised, without the folder as well."""
+def test_status_says_which_end_a_person_must_mend(tmp_path):
+    """Exit code 78 alone; a note that cannot be written changes no error."""
     for folder in (None, tmp_path / "not there"):
         with pytest.raises(LineError, match="chip"), last_failure.recorded(folder, VirtualClock()):
             raise LineError("no chip")
+    clock = VirtualClock()
+    failed(tmp_path, clock, BundleError("golden sweeps differ"))
+    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
+    assert "78" in line
+    assert "stopped" in line
+    failed(tmp_path, clock, LineError("no chip"))
+    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
+    assert "69" in line
+    assert "started" in line
+    failed(tmp_path, clock, KeyError("a fault of the program"))
+    assert "KeyError" in status.read(tmp_path / "status.json", 0)["why"]
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_friction_pulls_against_the_motion_while_the_finger_slides():
 
 
 def test_shear_only_adds_axes():
-    """The normal axis but for the noise; sets repeat; 0 without contact."""
+    """The normal axis is the same except for noise; sets repeat; 0 without contact."""
     samples, labels, _ = skin.sweep_set("T-HARD", 5, 1, SHEAR)
     assert (samples.shape, samples.dtype) == ((6, 1500, 4, 4, 3), np.int16)
     np.testing.assert_array_equal(labels, np.arange(6))

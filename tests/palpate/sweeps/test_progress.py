@@ -16,16 +16,12 @@ def counted(target: int, *pairs: tuple[str, str]) -> RecordingProgress:
 
 
 def test_each_material_is_wanted_at_every_position():
-    """All materials are wanted at each position of any material. A long list is cut."""
+    """Up to the target; removed pairs and no material do not count; long lists are cut."""
     progress = counted(2, *((material, "1") for material in "abcda"), ("a", "2"))
     found, missing = progress.line("a", "1").split("; missing: ")
     assert (found, len(missing.split(", "))) == ("a at 1: 2 of 2", 6)
     assert missing.startswith("a at 2: 1, b at 1: 1")
     assert missing.endswith("d at 1: 1 and 1 more")
-
-
-def test_nothing_is_missing_at_the_target():
-    """A removed pair is not listed; no material never counts."""
     assert "material" in counted(1).missing()
     progress = counted(1, ("a", ""))
     assert "material" in progress.missing()

@@ -125,8 +125,8 @@ def test_without_a_bundle_the_picture_has_no_positions(events):
     assert events.of("view")[-1]["state"] == "no-positions"
 
 
-def test_a_skin_that_goes_is_shown_at_once(board, events):
-    """With the next line; the counts of another skin get their own lowest value."""
+def test_a_skin_that_goes_is_shown_and_later_lines_are_passed_over(board, events):
+    """Another skin has its own lowest value; unknown lines change nothing."""
     frames(board, 2.0, 1.5, 1.5)
     board.take(feed_lines.state("absent", "check the cable"))
     wanted = feed_lines.state("absent", "check the cable")
@@ -136,6 +136,13 @@ def test_a_skin_that_goes_is_shown_at_once(board, events):
     board.take(feed_lines.state())
     board.take(feed_lines.frame(9.0, feed_lines.load(1.5, 1.5)))
     assert events.of("view")[-1]["state"] == "wait"
+    before = len(events.all)
+    board.take({"type": "weather", "sun": True})
+    board.take({"type": "lost", "lines": 7})
+    board.take({})
+    assert len(events.all) == before
+    board.take(feed_lines.health(2.0, later=1))
+    assert events.of("health")[-1]["later"] == 1
 
 
 def test_loss_is_counted_by_the_minute_and_late_sweeps_are_kept(board, events):
@@ -173,17 +180,6 @@ def test_a_restart_is_noted_with_what_has_changed(board, events):
     (note,) = events.of("note")
     assert note["time_ns"] == 9 * feed_lines.SECOND
     assert re.search("aaaa0001.* 9f3c2a1b", note["text"])
-
-
-def test_lines_of_a_later_version_are_passed_over(board, events):
-    """Lines of an unknown type and unknown fields change nothing."""
-    before = len(events.all)
-    board.take({"type": "weather", "sun": True})
-    board.take({"type": "lost", "lines": 7})
-    board.take({})
-    assert len(events.all) == before
-    board.take(feed_lines.health(2.0, later=1))
-    assert events.of("health")[-1]["later"] == 1
 
 
 HELLO, SWEEP = feed_lines.hello(), feed_lines.sweep(1)

@@ -71,7 +71,7 @@ def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
 
 
 def test_gauss_is_a_normal_distribution():
-    """Log likelihoods are scipy's; `independent` drops covariances, `first` later features."""
+    """scipy's likelihoods, without covariances or features; finite with one sweep."""
     rng = np.random.default_rng(1)
     y = np.repeat([0, 1, 2], 20)
     x = rng.normal(0, 1, (60, 3)) @ rng.normal(0, 1, (3, 3)) * [1, 30, 5] + y[:, None] + [5, 100, 9]
@@ -91,10 +91,6 @@ def test_gauss_is_a_normal_distribution():
             some.fit(x, y).decision_function(x),
             baselines.Gauss(independent).fit(x[:, :2], y).decision_function(x[:, :2]),
         )
-
-
-def test_gauss_bears_little_and_collinear():
-    """With one sweep, a copied and a constant feature the nearest mean wins, all finite."""
     x = np.array([[0.0, 0, 7], [1, 1, 7], [5, 5, 7]])
     gauss = baselines.Gauss().fit(x, np.arange(3))
     assert gauss.predict(x + 0.1).tolist() == [0, 1, 2]

@@ -44,11 +44,6 @@ def test_copies_have_each_alteration_but_broken_taxels():
     assert set(found.disturbed) < set(found.copies)
 
 
-def test_a_bundle_without_the_figures_says_so():
-    """In words for a person."""
-    assert "not measured" in altered_sweeps.text({})
-
-
 def space(sweeps: Dataset) -> tuple[Embed, Space]:
     """An embedding of the loads of two corners, with the means of its materials."""
 
@@ -61,7 +56,7 @@ def space(sweeps: Dataset) -> tuple[Embed, Space]:
 
 
 def test_held_out_copies_widen_shapes_and_set_the_limit():
-    """A disturbance that the box measures is allowed for; few held-out sweeps teach nothing."""
+    """Few teach nothing; a bundle without the figures says so in words."""
     train, held = windows(), windows(seed=1)
     embed, judge = space(train)
     tare = np.zeros(FORMAT.shape)
@@ -74,3 +69,4 @@ def test_held_out_copies_widen_shapes_and_set_the_limit():
     assert kept > 0.7
     assert "altered sweeps: " in altered_sweeps.text({altered_sweeps.FIGURES: found.figures})
     assert altered_sweeps.measure(embed, train, windows(3), judge, tare=tare) is None
+    assert "not measured" in altered_sweeps.text({})

@@ -176,6 +176,17 @@ def test_files_of_the_system_are_passed_over(tmp_path: Path, capsys: pytest.Capt
     assert "left out: 0" in capsys.readouterr().out
 
 
+def test_what_was_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A footer: the file, the line and its text, on the screen and in the report."""
+    folder = nine(tmp_path / "r")
+    with (folder / "wood_1.csv").open("a") as file:
+        file.write("@@\n")
+    given = ("--pattern", "{material}_{trial}.csv", "--report", str(tmp_path / "report.txt"))
+    assert imported(folder, *given) == 0
+    assert "line 41, which is '@@'" in capsys.readouterr().out
+    assert "to line 41" in (tmp_path / "report.txt").read_text()
+
+
 def test_names_are_equal_in_every_normal_form(tmp_path: Path):
     """A decomposed ö in a file's name, in --rename and in --pattern is the composed one."""
     folder = tmp_path / "r"
@@ -226,17 +237,6 @@ def test_columns_give_material_and_session(tmp_path: Path):
     assert made.groups["session"].tolist() == ["2026-01-10", "2026-01-10", "2026-01-11"]
     assert made.groups["recording"].tolist() == [0, 1, 2]
     np.testing.assert_array_equal(made.samples[0, :, 0, 0], np.arange(15, 25))
-
-
-def test_what_was_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A footer: the file, the line and its text, on the screen and in the report."""
-    folder = nine(tmp_path / "r")
-    with (folder / "wood_1.csv").open("a") as file:
-        file.write("@@\n")
-    given = ("--pattern", "{material}_{trial}.csv", "--report", str(tmp_path / "report.txt"))
-    assert imported(folder, *given) == 0
-    assert "line 41, which is '@@'" in capsys.readouterr().out
-    assert "to line 41" in (tmp_path / "report.txt").read_text()
 
 
 @pytest.mark.slow

@@ -28,8 +28,8 @@ def told(sweeps: sets.Dataset) -> dict[str, list[str]]:
     return {line.partition(": ")[0]: line.partition(": ")[2].split(", ") for line in lines}
 
 
-def test_a_set_is_described():
-    """Sweeps, format, materials, recordings, groups; long lists are shortened."""
+def test_a_set_is_described_with_what_is_confounded():
+    """Format, materials, groups; a material or value alone; long lists are shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
     first, *_ = summary.description(s)
@@ -41,10 +41,6 @@ def test_a_set_is_described():
         "speed": ["4: 0", "1", "2", "3"],
     }
     assert told(s.take(np.arange(1, 58)))["recordings"][1] == "of 1 to 2 each"
-
-
-def test_what_is_confounded_is_told():
-    """A single material at a value, or a single value; not a group of one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
     every = summary.description(s)

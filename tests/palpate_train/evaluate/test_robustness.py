@@ -61,8 +61,8 @@ def test_merged_by_hand():
     )
 
 
-def test_what_breaks_first_comes_first():
-    """By the share of the range that they take, then by the loss; without a fall left out."""
+def test_what_breaks_first_comes_first_with_its_interval():
+    """By the share of its range, then the loss; sweeps of one attachment fail together."""
     found = {
         name: {"lost": lost, "falls": fall, "severities": [0, most]}
         for name, lost, fall, most in (
@@ -73,10 +73,6 @@ def test_what_breaks_first_comes_first():
         )
     }
     assert robustness.breaks_first(found) == ["d", "a", "b"]
-
-
-def test_intervals_are_by_attachment():
-    """Sweeps of one attachment fail together: a wider interval."""
     right = np.repeat([True, True, False], 4)
     widths = []
     for groups in ({}, {"position": np.repeat([0, 1, 2], 4)}):

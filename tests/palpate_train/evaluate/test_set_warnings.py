@@ -19,8 +19,8 @@ def of_protocol(sweeps: Dataset, text: str) -> list[str]:
     return list(set_warnings.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
 
 
-def test_materials_that_cannot_be_named_are_counted():
-    """Every tested sweep, where sessions are left out; no line with another protocol."""
+def test_what_no_fold_can_judge_is_counted():
+    """Materials of one session where these are left out; frames shared by windows."""
     sweeps = easy(8)
     sweeps.groups["session"] = sweeps.labels * 2 + np.arange(24) % 2
     half = replace(sweeps, groups=sweeps.groups | {"session": sweeps.labels})
@@ -31,10 +31,6 @@ def test_materials_that_cannot_be_named_are_counted():
     (line,) = [line for line in set_warnings.of_set(half) if "session" in line]
     assert "(low, middle, high)" in line
     assert not any("session only" in line for line in set_warnings.of_set(sweeps))
-
-
-def test_shared_frames_are_counted_for_the_folds():
-    """Overlapping noise without recordings in random folds; not if recordings are stated."""
     rng = np.random.default_rng(1)
     long = rng.normal(0, 20, (8, 640, 2, 2)).astype(np.int16)
     samples = np.concatenate([[one[s : s + 64] for s in range(0, 577, 16)] for one in long])
@@ -48,7 +44,7 @@ def test_shared_frames_are_counted_for_the_folds():
 
 
 def test_baselines_find_what_they_look_at():
-    """Means distinguish offsets, bands distinguish pitches, and neither does the other's work."""
+    """Means offsets, bands pitches; a better one is named, an equal one is not."""
     folds = Protocol("leave:session").folds(tones(), 1)
     found = trivial.figures(tones(), folds)
     assert found[trivial.BANDS]["right"] == 36
@@ -58,6 +54,11 @@ def test_baselines_find_what_they_look_at():
     constant = replace(tones(), samples=np.ones_like(tones().samples))
     assert trivial.figures(constant, folds)[trivial.MEANS]["n"] == 36
     assert trivial.beside_a_fit(tones(recordings=1)) == {}
+    baselines = {trivial.MEANS: {"accuracy": 0.7}, trivial.BANDS: {"accuracy": 0.8}}
+    result = {"method": "ours", "protocol": "leave:speed", "baselines": baselines}
+    for right, told in ((79, True), (80, False), (95, False)):
+        found = trivial.above(result | {"window": {"right": right, "total": 100}})
+        assert (trivial.BANDS in found) is told
 
 
 @pytest.mark.slow
@@ -90,12 +91,3 @@ def test_evaluate_shows_the_answers_of_the_box(tmp_path: Path, capsys: pytest.Ca
     assert right == counts[0]
     assert main([*words, "--label-alone"]) == 0
     assert json.loads(out.read_text())[0]["box"] is None
-
-
-def test_a_baseline_above_a_method_is_told():
-    """With the name of the better one; not if the method is as good."""
-    baselines = {trivial.MEANS: {"accuracy": 0.7}, trivial.BANDS: {"accuracy": 0.8}}
-    result = {"method": "ours", "protocol": "leave:speed", "baselines": baselines}
-    for right, told in ((79, True), (80, False), (95, False)):
-        found = trivial.above(result | {"window": {"right": right, "total": 100}})
-        assert (trivial.BANDS in found) is told

@@ -105,8 +105,8 @@ def test_parameters_without_a_fit(fitted: PalpateClassifier):
             answer(SWEEPS)
 
 
-def test_labels_and_probabilities(fitted: PalpateClassifier):
-    """In the order of classes_; both shapes of sweeps are the same."""
+def test_answers_and_features_are_those_of_the_head(fitted: PalpateClassifier):
+    """In the order of classes_, for both shapes; its own head gives its logits."""
     assert fitted.classes_.tolist() == ["felt", "wood"]
     assert fitted.score(SWEEPS[36:], LABELS[36:]) == 1
     found = fitted.predict_proba(SWEEPS[36:])
@@ -115,6 +115,15 @@ def test_labels_and_probabilities(fitted: PalpateClassifier):
     np.testing.assert_array_equal(fitted.predict_proba(frames[36:]), found)
     np.testing.assert_array_equal(sweeps.raw_counts(frames), sweeps.raw_counts(SWEEPS, (2, 2)))
     assert fitted.sweeps.groups["position"].tolist() == GROUPS[:36].tolist()
+    features = fitted.transform(SWEEPS[36:])
+    weight, bias = fitted.fit_.int8_head()
+    logits = features @ weight.T + bias
+    np.testing.assert_allclose(softmax(logits), fitted.predict_proba(SWEEPS[36:]), atol=1e-5)
+    assert fitted.get_feature_names_out().shape == features.shape[1:]
+    piped = pipeline.make_pipeline(small(), linear_model.LogisticRegression()).fit(
+        SWEEPS[:36], LABELS[:36]
+    )
+    assert piped.score(SWEEPS[36:], LABELS[36:]) == 1
 
 
 @pytest.mark.slow
@@ -269,19 +278,6 @@ def test_what_cannot_be_counts_is_refused(fitted: PalpateClassifier, what: str):
     for way in ways:
         with pytest.raises(ValueError, match=why):
             way(x)
-
-
-def test_features_are_those_of_the_answers(fitted: PalpateClassifier):
-    """A head of one's own stands on them; with the model's own head they give its logits."""
-    features = fitted.transform(SWEEPS[36:])
-    weight, bias = fitted.fit_.int8_head()
-    logits = features @ weight.T + bias
-    np.testing.assert_allclose(softmax(logits), fitted.predict_proba(SWEEPS[36:]), atol=1e-5)
-    assert fitted.get_feature_names_out().shape == features.shape[1:]
-    piped = pipeline.make_pipeline(small(), linear_model.LogisticRegression()).fit(
-        SWEEPS[:36], LABELS[:36]
-    )
-    assert piped.score(SWEEPS[36:], LABELS[36:]) == 1
 
 
 def test_a_pickle_answers_without_the_sweeps(fitted: PalpateClassifier, tmp_path: Path):

@@ -110,19 +110,8 @@ def test_the_accuracy_to_expect_is_that_of_choices_that_did_not_see_the_part():
     assert replace(judged, clusters=np.zeros(96, int)).expected(list(guesses), 0.0) is None
 
 
-def test_the_error_is_that_of_what_fails_together():
-    """The same loss at one place has a larger error than at all places; no loss has no error."""
-    here, everywhere = missing(slice(12)), missing(slice(0, None, 8))
-    one, all_ = (dial.difference(EVERYTHING, x, CLUSTERS) for x in (here, everywhere))
-    assert one.mean == all_.mean == 0.125
-    assert one.se == pytest.approx(0.125)  # one of eight places failed
-    assert all_.se == pytest.approx(np.std(everywhere, ddof=1) / np.sqrt(96))
-    same = dial.difference(EVERYTHING, EVERYTHING, CLUSTERS)
-    assert same.json() == {"mean": 0, "se": 0, "low": 0, "high": 0}
-
-
-def test_cheap_is_what_takes_little_of_the_scarcer():
-    """The larger of the shares of time and bytes; without a budget bytes, then time."""
+def test_cost_and_error_are_those_of_the_scarcer_and_of_groups():
+    """The larger share of time and bytes; one place has a larger error than all."""
     small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
     for budget, dearer, cheaper in (
         (Budget(ms=1, kb=1000, slower=2), small, fast),
@@ -134,6 +123,13 @@ def test_cheap_is_what_takes_little_of_the_scarcer():
     assert Budget(ms=1, kb=1000, slower=2).used(small) == {"ms": 0.8, "kb": 0.02}
     assert Budget(ms=0.5, slower=2).over(small).endswith(": 0.8 ms of 0.5")
     assert not Budget(kb=20).over(small)
+    here, everywhere = missing(slice(12)), missing(slice(0, None, 8))
+    one, all_ = (dial.difference(EVERYTHING, x, CLUSTERS) for x in (here, everywhere))
+    assert one.mean == all_.mean == 0.125
+    assert one.se == pytest.approx(0.125)  # one of eight places failed
+    assert all_.se == pytest.approx(np.std(everywhere, ddof=1) / np.sqrt(96))
+    same = dial.difference(EVERYTHING, EVERYTHING, CLUSTERS)
+    assert same.json() == {"mean": 0, "se": 0, "low": 0, "high": 0}
 
 
 @cache

@@ -34,8 +34,8 @@ def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
     assert dict(lesson.left_out) == {"no material": 1, "gap": 1, "damaged": 1, "another format": 1}
 
 
-def test_a_missing_position_counts_and_no_sweep_is_an_error(tmp_path: Path):
-    """Taught with others; the message counts the omitted sweeps."""
+def test_what_can_be_taught_and_judged(tmp_path: Path):
+    """A missing position is a place; one sweep is not judged; none is an error."""
     sweeps(tmp_path, "a", "b", position="1")
     sweeps(tmp_path, "a", "b", first=3)
     lesson = Lesson.read(tmp_path)
@@ -45,10 +45,6 @@ def test_a_missing_position_counts_and_no_sweep_is_an_error(tmp_path: Path):
         Lesson.read(tmp_path / "bare")
     with pytest.raises(FormatError, match="be read"):
         Lesson.read(tmp_path / "nowhere")
-
-
-def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
-    """Materials with one sweep are left out of an assessment; one material alone is an error."""
     sweeps(tmp_path, "a", "a", "b", "b", "c")
     lesson = Lesson.read(tmp_path).repeated()
     assert lesson.sweeps.materials == ("a", "b")

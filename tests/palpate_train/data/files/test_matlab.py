@@ -43,14 +43,26 @@ def test_numbers_are_read_in_their_type(tmp_path: Path, version: str):
         np.testing.assert_array_equal(found.vectors["t"], np.arange(40))
 
 
-def test_the_other_byte_order_is_read(tmp_path: Path):
-    """A matrix of version 4 of a machine with the highest byte first, put together by hand."""
+def test_other_byte_orders_and_objects_beside_frames(tmp_path: Path):
+    """A matrix of version 4 by hand; strings and tables are opaque, of class 17."""
     head = np.array([1000, 2, 3, 0, 5], ">i4").tobytes() + b"skin\0"
     values = np.array([[1, 2, 3], [4, 5, 6]], ">f8")
     (tmp_path / "a.mat").write_bytes(head + values.tobytes(order="F"))
     found = raw_files.read(tmp_path / "a.mat").values
     np.testing.assert_array_equal(found, values)
     assert found.dtype.isnative
+    data = bytearray(saved(tmp_path / "a.mat", skin=SKIN).read_bytes())
+
+    def element(kind: int, content: bytes) -> bytes:
+        return np.array([kind, len(content)], "<u4").tobytes() + content
+
+    flags = element(6, bytes([17]) + bytes(7))
+    names = [element(1, text.ljust(8, b"\0")) for text in (b"when", b"MCOS", b"datetime")]
+    shape, name = element(5, np.array([6, 1], "<i4").tobytes()), element(1, b"")
+    ids = element(6, bytes([13]) + bytes(7)) + shape + name + element(6, bytes(24))
+    data += element(14, flags + b"".join(names) + element(14, ids))
+    (tmp_path / "a.mat").write_bytes(data)
+    np.testing.assert_array_equal(raw_files.read(tmp_path / "a.mat").values, SKIN)
 
 
 def test_arrays_are_found_in_structures(tmp_path: Path):
@@ -91,22 +103,6 @@ def test_version_7_3_is_read_beside_objects(tmp_path: Path, name: str):
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(raw_files.read(path).values, SKIN)
     np.testing.assert_array_equal(raw_files.read(path.rename(tmp_path / "a.h5")).values, SKIN)
-
-
-def test_objects_of_version_7_are_passed_over(tmp_path: Path):
-    """MATLAB's strings and tables are opaque objects: an element of class 17."""
-    data = bytearray(saved(tmp_path / "a.mat", skin=SKIN).read_bytes())
-
-    def element(kind: int, content: bytes) -> bytes:
-        return np.array([kind, len(content)], "<u4").tobytes() + content
-
-    flags = element(6, bytes([17]) + bytes(7))
-    names = [element(1, text.ljust(8, b"\0")) for text in (b"when", b"MCOS", b"datetime")]
-    shape, name = element(5, np.array([6, 1], "<i4").tobytes()), element(1, b"")
-    ids = element(6, bytes([13]) + bytes(7)) + shape + name + element(6, bytes(24))
-    data += element(14, flags + b"".join(names) + element(14, ids))
-    (tmp_path / "a.mat").write_bytes(data)
-    np.testing.assert_array_equal(raw_files.read(tmp_path / "a.mat").values, SKIN)
 
 
 @pytest.mark.slow
