@@ -176,7 +176,7 @@ if [ "$1" = remove ]; then
   for one in {own}; do
     if [ -L "$one" ]; then rm -f "$one"; fi
   done
-  rm -rf {LINK} {LINK}-* {LINK}.previous
+  rm -rf {LINK} {LINK}-* {LINK}.previous {LINK}.trial {LINK}.rejected
   [ ! -d /run/systemd/system ] || systemctl daemon-reload
   echo "palpate: sweeps and bundles stay in /var/lib/palpate, settings in /etc/palpate"
 elif [ "$1" = purge ]; then
@@ -209,13 +209,7 @@ echo "palpate: building {release}"
 )
 {install.self_test(release)}
 before=$(readlink {LINK} || true)
-if [ -z "$before" ]; then
-  ( {install.swap(release, "")}
-  )
-elif [ "$before" != "$name" ]; then
-  ( {install.swap(release, '"$before"')}
-  )
-fi
+[ "$before" = "$name" ] || {install.swap(release)} || exit 1
 if [ ! -d /run/systemd/system ]; then
   echo "palpate: installed; it starts with the system"
   exit 0
@@ -229,8 +223,7 @@ def _comes_up() -> str:
   journalctl -q -t palpate -n 5 -o cat >&2 || true
   old=$(readlink {LINK}.previous || true)
   if [ -n "$old" ] && [ "$old" != "$name" ]; then
-    ( {install.swap("/opt/$old", '"$name"')}
-    )
+    {install.swap("/opt/$old")}
     ! start || fail "the service did not come up with $name; $old runs again"
   fi
   [ "$(systemctl show palpate --value -p ExecMainStatus)" = 78 ] || \\

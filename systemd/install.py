@@ -77,16 +77,21 @@ PIP = (
 SELF_TEST = """
 import sys; from pathlib import Path; from palpate.bundle import bundle
 from palpate.cli.common import load_bundle; from palpate.core import clock, config, errors
-from palpate.inference import classifier
+from palpate.inference import classifier; from palpate.runtime import replay
 try:
     settings = config.load(None, folder=Path(sys.argv[1]))
     for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):
         classifier.Classifier(one, clock.SystemClock()).self_test()
+    kept = settings.kept("black-box")
+    count, changed = replay.changed(kept, settings, one)
 except errors.ApplianceError as e:
     sys.exit(str(e))
+if changed:
+    sys.exit(f"{len(changed)} of {count} kept sweeps are answered otherwise ({changed[-1]}); if "
+             f"that is wanted, move them away from {kept}")
 """
-"""Program that a new release must run without an error: reads the settings, and runs the golden
-sweeps of the packaged bundle and of the bundle in use."""
+"""Program that a new release must run without an error: reads the settings, runs the golden sweeps
+of the packaged bundle and of the bundle in use, and answers the kept sweeps again."""
 PACKAGES_S = BUILD_S = 600
 """Time limits for installing packages and for building the environment, on a slow card."""
 SETUP_S = 120
@@ -377,7 +382,7 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
     ):
         return f"{name} runs already"
     if before != Path(release).name:
-        box.run("swapping the link", swap(release, before), user="root")
+        box.run("swapping the link", swap(release), user="root")
     try:
         ready = _start(box)
     except Failed as e:
@@ -408,7 +413,7 @@ def _swap_back(box: FleetBox, release: str) -> str:
     before = box.run("looking for the old release", f"readlink {LINK}.previous || true")
     if before in ("", Path(release).name):
         return ""
-    box.run("swapping back", swap(f"/opt/{before}", Path(release).name), user="root")
+    box.run("swapping back", swap(f"/opt/{before}"), user="root")
     try:
         _start(box)
     except Failed as e:
@@ -416,12 +421,11 @@ def _swap_back(box: FleetBox, release: str) -> str:
     return f"; so {before} runs again"
 
 
-def swap(release: str, before: str) -> str:
-    """Commands that point the link to a release, and record the previous release."""
-    previous = f"ln -sfn {before} {LINK}.previous" if before else "true"
-    return f"""set -e; {previous}
-ln -sfn {Path(release).name} {LINK}.new; sync -f /opt
-mv -T {LINK}.new {LINK}; sync -f /opt"""
+def swap(release: str) -> str:
+    """The command that makes a release current, on trial if there was another before. It fails for
+    a release that was sent back."""
+    name = f'"$(basename {release})"'
+    return f"{release}/bin/python -I -m palpate.deployment.releases activate {name}"
 
 
 def _start(box: FleetBox) -> bool:

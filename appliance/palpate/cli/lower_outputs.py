@@ -13,6 +13,7 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import gpiod
@@ -21,6 +22,7 @@ from palpate.cli.options import NO_SETTINGS, add_settings
 from palpate.core import config
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import EX_CONFIG, ApplianceError
+from palpate.deployment import releases
 from palpate.io.gpio_lines import Lines
 from palpate.service import last_failure
 
@@ -38,6 +40,8 @@ def main(
     add_settings(parser)
     parser.set_defaults(**NO_SETTINGS)
     args = parser.parse_args(argv)
+    with suppress(OSError):
+        releases.note_fault(environ)
     try:
         loaded = config.load(args.board, args.set, folder=args.config_dir, unit=args.unit)
         clock = clock or SystemClock()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import in_journal, log
 from palpate.core.observer import Facts, Observer
+from palpate.deployment import release_trial, releases
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
@@ -29,6 +30,7 @@ from palpate.service import last_failure
 from palpate.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
+    from palpate.deployment.release_trial import ReleaseTrial
     from palpate.deployment.shadow import Shadow
     from palpate.deployment.store import Choice
 
@@ -36,16 +38,26 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
     settings = load_settings(args)
-    with last_failure.recorded(None if args.sim else settings.store.runtime_folder, SystemClock()):
+    folder = None if args.sim else settings.store.runtime_folder
+    release = release_trial.observed()
+    with last_failure.recorded(folder, SystemClock()), release or nullcontext():
         choice = None if settings.classifier.bundle else assembly.store(settings).choose()
         if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
             from palpate.cli import teach_command  # here: a box in service does without it
 
             return teach_command.until_taught(args, settings)
-        return _classify(args, settings, choice)
+        if release and choice and choice.trial:
+            release.stopping()  # it must be clear which of both was the cause of a failure
+            release = None
+        return _classify(args, settings, choice, release)
 
 
-def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None) -> int:
+def _classify(
+    args: argparse.Namespace,
+    settings: Config,
+    choice: Choice | None,
+    release: ReleaseTrial | None,
+) -> int:
     stopped = StopFlag()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
@@ -55,18 +67,22 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
         disk = DiskThread()
-        if trial:
-            trial.disk = disk
+        for one in filter(None, (trial, release)):
+            one.disk = disk
+        sent_back = releases.text()
         # not beside a trial: if the program dies, it must be clear which bundle was the cause
         shadow = None if trial else _shadow(args, settings, current, devices, disk)
         facts = {
             "trial": lambda: trial.text if trial else "",
+            "release": lambda: release.text if release else sent_back,
             "shadow": lambda: shadow.agreement.text if shadow else "",
             "disk": lambda: disk.text,
             "unsigned": lambda: unsigned,
         }
         reports = _reports(settings, current, devices.source, facts, stack, disk)
-        observers = [o for o in (disk, Notifier(SystemClock()), trial, shadow, *reports) if o]
+        observers = [
+            o for o in (disk, Notifier(SystemClock()), trial, release, shadow, *reports) if o
+        ]
         recorded = capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack
         box = assembly.box(*parts, capture=recorded, observers=observers)

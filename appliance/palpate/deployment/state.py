@@ -43,7 +43,7 @@ class Goal:
         return all(done) if self.both else any(done)
 
 
-class Progress(NamedTuple):
+class TrialProgress(NamedTuple):
     """The part of a Standing that the program on trial records."""
 
     starts: int

@@ -48,8 +48,8 @@ from palpate.deployment.state import (
     PACKAGED,
     STATE_FILE,
     Goal,
-    Progress,
     StoreState,
+    TrialProgress,
 )
 from palpate.deployment.trial import Trial
 from palpate.inference.session import try_all
@@ -277,7 +277,7 @@ class Store:
         """The end of a trial."""
         return Goal(self.settings.trial_sweeps, self.settings.trial_s)
 
-    def note(self, sha: str, progress: Progress, *, counted: bool) -> None:
+    def note(self, sha: str, progress: TrialProgress, *, counted: bool) -> None:
         """Record the progress of the trial of `sha`, and whether this start counts in its starts.
         Does not wait: raises ApplianceError if another command holds the lock."""
         boot = self._boot if counted else ""

@@ -18,7 +18,7 @@ from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
 from palpate.core.status import Status
-from palpate.deployment.state import Progress
+from palpate.deployment.state import TrialProgress
 
 if TYPE_CHECKING:
     from palpate.core.health import Health
@@ -42,7 +42,7 @@ class TrialStore(Protocol):
     def goal(self) -> Goal:
         """The end of the trial."""
 
-    def note(self, sha: str, progress: Progress, *, counted: bool) -> None:
+    def note(self, sha: str, progress: TrialProgress, *, counted: bool) -> None:
         """Record the progress of the trial of `sha`, and whether this start counts."""
 
     def commit(self, sha: str | None, wait_s: float) -> bool:
@@ -151,7 +151,7 @@ class Trial(Observer):
     def _note(self, counts: bool) -> Callable[[], object]:
         """The write of the present progress."""
         starts, s = self._starts - (not counts), round(self._streamed_ns / 1e9, 1)
-        progress = Progress(starts, self._sweeps, s, self._worked)
+        progress = TrialProgress(starts, self._sweeps, s, self._worked)
         return partial(self._store.note, self._sha, progress, counted=counts)
 
     def _commit(self) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.taxels import BrokenTaxels
-from palpate.bundle.bundle import Bundle
+from palpate.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
@@ -35,6 +35,9 @@ SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
 sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
+LATEST = 500
+"""Number of the latest sweeps that a new release must answer as before."""
+CLASSIFIED = {status for status in Status if status.classified}
 RULE = ("fuse", "min_probability", "max_sweeps", "conflict", "object_s", "strangers")
 """The settings of the classifier that a sidecar holds as `rule`."""
 
@@ -227,6 +230,39 @@ def _folder(folder: Path, classify: SweepReplay, out: Callable[[str], object]) -
         outcomes[_print(path, found, out)] += 1
     out(f"{len(paths)} sweeps: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.items())}\n")
     return int(bool(outcomes.keys() & {DIFFERENT, BROKEN}) or outcomes[OTHER] == len(paths))
+
+
+def changed(folder: Path, settings: Config, bundle: Bundle) -> tuple[int, list[str]]:
+    """How many of the latest sweeps in `folder` this program answers by the bundle that answered
+    them, and the sweeps that it answers otherwise, each with the change. A probability may differ
+    by GOLDEN_TOLERANCE."""
+    classify, count, found = SweepReplay(settings, bundle), 0, []
+    for path in sorted(folder.rglob("*.npy"), key=_order)[-LATEST:]:
+        try:
+            kept = KeptSweep.read(path)
+            result = classify(kept)
+        except FormatError:  # of another bundle, or damaged: it says nothing about the program
+            continue
+        count += result.outcome != SILENT
+        if result.outcome == DIFFERENT and (why := _beyond(kept.verdict, result.verdict)):
+            found.append(f"{path.name}: {why}")
+    return count, found
+
+
+def _beyond(was: dict[str, Any], now: Verdict | None) -> str:
+    """The change of an answer if it is larger than the tolerance, else ""."""
+    if now is None:
+        return "it is not answered any more"
+    before, own = np.asarray(was.get("own", []), np.float64), now.own
+    near = before.shape == own.shape and np.allclose(before, own, 0, GOLDEN_TOLERANCE)
+    # near a limit, "ok" may become "unsure" within the tolerance
+    if near and (was.get("status") == now.status or {was.get("status"), now.status} <= CLASSIFIED):
+        return ""
+    return f"it was {_said(was)}, and is {_said(now.as_dict())}"
+
+
+def _said(verdict: dict[str, Any]) -> str:
+    return f"{verdict.get('status')} {verdict.get('label', '')} {verdict.get('probability')}"
 
 
 def _order(path: Path) -> tuple[Path, int, str]:

@@ -19,7 +19,7 @@ from palpate.cli import bundle_commands
 from palpate.core.config import StoreConfig
 from palpate.core.errors import ApplianceError, BundleError, ConfigError, ModelError, TemporaryError
 from palpate.deployment import store
-from palpate.deployment.state import MOST_STARTS, PACKAGED, Progress, Standing, StoreState
+from palpate.deployment.state import MOST_STARTS, PACKAGED, Standing, StoreState, TrialProgress
 from tests.campaigns import flips
 from tests.factories import deliveries
 from tests.factories.deliveries import Delivery
@@ -50,7 +50,7 @@ def test_a_fresh_box_runs_the_packaged_bundle(box):
 def test_the_progress_of_a_trial_is_noted(box):
     """Starts, sweeps and seconds; a start that ended in order counts for no boot."""
     for counted in (True, False):
-        box.store.note("a", Progress(2, 3, 12.3, True), counted=counted)
+        box.store.note("a", TrialProgress(2, 3, 12.3, True), counted=counted)
         kept = box.store.state.of("a")
         assert (kept.starts, kept.sweeps, kept.streamed_s, kept.worked) == (2, 3, 12.3, True)
         assert bool(kept.boot) is counted

@@ -22,7 +22,7 @@ from palpate.core.sweep_file import save, sidecar
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.runtime.replay import replay
+from palpate.runtime.replay import changed, replay
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
@@ -225,6 +225,26 @@ def test_every_difference_is_told(in_service, default_bundle):
     for n, told in ((1, "(other scores)"), (2, "(label 'velvet' is now "), (4, "")):
         assert outcomes[n - 1].startswith(f"{at(folder, n).name}: DIFFERENT {told}")
     assert outcomes[-1].startswith("30 sweeps: ")
+
+
+def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
+    in_service, default_bundle, monkeypatch
+):
+    """The same program changes nothing, nor does a last bit. A program that reads counts 10 % too
+    high is told; sweeps of another bundle are left out."""
+    folder, _ = in_service
+    one_bit_off(at(folder, 4), "own")
+    count, found = changed(folder, OTHERWISE, default_bundle)
+    assert (count, found) == (SWEEPS, [])
+    change(at(folder, 3), bundle="00000000")
+    assert changed(folder, OTHERWISE, default_bundle)[0] == SWEEPS - 1
+    outputs = Classifier.outputs
+
+    def worse(self: Classifier, taxels: np.ndarray, *names: str) -> Any:
+        return outputs(self, np.clip(taxels * 1.1, 0, 255).astype(taxels.dtype), *names)
+
+    monkeypatch.setattr(Classifier, "outputs", worse)
+    assert changed(folder, OTHERWISE, default_bundle)[1]
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle):

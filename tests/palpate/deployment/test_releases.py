@@ -1,0 +1,277 @@
+"""Releases side by side: which one runs after installs, crashes, power-offs and faults."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import ConfigError
+from palpate.core.health import Health
+from palpate.core.types import Status, Verdict
+from palpate.deployment import release_trial, releases
+from palpate.deployment.release_trial import ReleaseTrial
+from palpate.deployment.releases import Releases
+from tests.factories import feeds
+
+SECOND = 1_000_000_000
+OLD, NEW, NEXT = "palpate-1-a", "palpate-2-b", "palpate-3-c"
+
+
+def health(time_s: float, streams: bool = True) -> Health:
+    """Health of the box at this time."""
+    return feeds.HEALTH._replace(time_ns=round(time_s * SECOND), streams=streams, sweeping=False)
+
+
+def verdict(status: Status = Status.OK) -> Verdict:
+    """An answer, with a label if it is ok."""
+    label = "Canvas" if status is Status.OK else ""
+    return Verdict(7, 0, status, label, 1.0, 1.0, np.empty(0), 1, 0, 0, "", "no memory")
+
+
+class TrialBox:
+    """A box whose service is started and ended in several ways."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.opt, self.report, self.boot = folder / "opt", folder / "var", folder / "boot_id"
+        for name in (OLD, NEW, NEXT):
+            (self.opt / name).mkdir(parents=True)
+        self.report.mkdir()
+        self.boot.write_text("first\n")
+        self.env = {"STATE_DIRECTORY": str(self.report)}
+        self.releases = Releases(self.opt, self.report, self.boot)
+        self._patch = monkeypatch
+        self.releases.activate(OLD)
+
+    def start(self) -> ReleaseTrial | None:
+        """Start the service, as systemd does. Returns its trial."""
+        self.said = self.releases.begin()
+        self._patch.setattr(sys, "prefix", str(self.opt / "palpate"))
+        return release_trial.observed(self.env)
+
+    @property
+    def runs(self) -> str:
+        """The release that runs."""
+        return self.releases.current
+
+
+@pytest.fixture
+def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrialBox:
+    """A box with a new release on trial."""
+    made = TrialBox(tmp_path, monkeypatch)
+    made.releases.activate(NEW)
+    return made
+
+
+def crash(box: TrialBox) -> None:
+    """A start that ends without an orderly end."""
+    box.start()
+
+
+def stop(box: TrialBox) -> None:
+    """A start that is stopped in order."""
+    trial = box.start()
+    if trial:
+        trial.stopping()
+
+
+def unplugged(box: TrialBox) -> None:
+    """A start without a skin, killed."""
+    trial = box.start()
+    if trial:
+        trial.turn(health(1, streams=False))
+
+
+def cut(box: TrialBox) -> None:
+    """A start that a loss of power ends soon."""
+    box.start()
+    box.boot.write_text(f"after {os.urandom(4).hex()}\n")
+
+
+def day(box: TrialBox) -> None:
+    """A day with one sweep and 301 s of streaming that the mains switch ends."""
+    trial = box.start()
+    for t in (0, 300, 301):
+        if trial:
+            trial.turn(health(t))
+    if trial:
+        trial.answered(verdict())
+        trial.turn(health(302))
+    box.boot.write_text(f"after {os.urandom(4).hex()}\n")
+
+
+def work(box: TrialBox) -> None:
+    """A start that answers a sweep and then crashes."""
+    trial = box.start()
+    if trial:
+        trial.answered(verdict())
+        trial.turn(health(1))
+
+
+def fault(box: TrialBox) -> None:
+    """A start that a segmentation fault ends."""
+    box.start()
+    releases.note_fault(box.env | {"EXIT_CODE": "dumped", "EXIT_STATUS": "SEGV"})
+
+
+def killed(box: TrialBox) -> None:
+    """A start that a person or the kernel kills."""
+    box.start()
+    releases.note_fault(box.env | {"EXIT_CODE": "killed", "EXIT_STATUS": "KILL"})
+
+
+def failing(box: TrialBox) -> None:
+    """A start in which a sweep fails."""
+    trial = box.start()
+    if trial:
+        trial.answered(verdict(Status.FAILED))
+        trial.turn(health(1))
+        trial.stopping()
+
+
+@pytest.mark.parametrize(
+    ("events", "runs"),
+    [
+        ([crash] * 2, NEW),
+        ([crash] * 3, OLD),
+        ([work] * 3, OLD),
+        ([crash, stop, crash, stop], NEW),
+        ([stop] * 30, NEW),
+        ([unplugged] * 30, NEW),
+        ([day] * 30, NEW),
+        ([*[cut] * 9, day] * 3, NEW),
+        ([cut] * 10, OLD),
+        ([killed] * 2, NEW),
+        ([killed] * 3, OLD),
+        ([day, fault], OLD),
+        ([failing], OLD),
+        ([crash, day, day, crash, day, day, crash], OLD),
+    ],
+    ids=lambda one: one if isinstance(one, str) else "-".join(e.__name__ for e in one[:4]),
+)
+def test_what_runs_after(box: TrialBox, events: list[Callable[[TrialBox], None]], runs: str):
+    """Crashes, faults and failed sweeps send a release back; stops, unplugged skins and a month of
+    evenings at the mains switch do not. A release that was sent back says why, in what runs then,
+    and is refused until the list of rejected ones is removed."""
+    for event in events:
+        event(box)
+        assert box.runs == NEW
+    trial = box.start()
+    assert (box.runs, trial is not None) == (runs, runs == NEW)
+    if runs == OLD:
+        assert NEW in box.said
+        assert NEW in releases.text()
+        with pytest.raises(ConfigError, match="rejected"):
+            box.releases.activate(NEW)
+        (box.opt / "palpate.rejected").unlink()
+        box.releases.activate(NEW)
+        assert (box.start() is not None, box.runs) == (True, NEW)
+
+
+def test_fifty_sweeps_and_a_day_of_streaming_end_the_trial(box: TrialBox):
+    """Both, over days of an hour that the mains switch ends, each with some minutes that were not
+    recorded yet. From the next start on nothing of the trial is left, and the service writes no
+    report."""
+    for n in range(30):
+        trial = box.start()
+        assert trial, n
+        for t in range(0, 3601, 60):
+            trial.turn(health(t))
+            if t < 120:
+                trial.answered(verdict())
+        box.boot.write_text(f"day {n}\n")
+        if not trial.text:
+            break
+    assert n == 25
+    assert box.start() is None
+    assert (box.runs, box.releases.trial, box.said) == (NEW, None, "")
+    assert sorted(path.name for path in box.opt.iterdir() if path.is_symlink()) == [
+        "palpate",
+        "palpate.previous",
+    ]
+    assert not (box.opt / "palpate.trial").exists()
+
+
+def test_a_second_release_on_trial_goes_back_to_the_proven_one(box: TrialBox):
+    """Not to the one that is on trial; and by hand the way back is no trial."""
+    box.start()
+    box.releases.activate(NEXT)
+    for event in (crash, crash, crash, stop):
+        event(box)
+    assert box.runs == OLD
+    box.releases.activate(NEW)
+    assert box.start() is not None
+    box.releases.activate(OLD)
+    assert (box.start(), box.runs, box.releases.trial) == (None, OLD, None)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"id": 3}',
+        b'{"id": "x", "why": "bad"}',
+        b"[" * 9999,
+        None,
+        "link",
+        "fifo",
+    ],
+    ids=lambda one: str(one)[:12],
+)
+def test_what_another_puts_in_place_of_the_report_counts_for_nothing(
+    box: TrialBox, tmp_path: Path, content: bytes | str | None
+):
+    """Root reads a file that the service's user may replace: it is neither followed, nor waited
+    for, nor believed."""
+    box.start()
+    file = box.report / releases.REPORT
+    file.unlink(missing_ok=True)
+    if content == "link":
+        (tmp_path / "other").write_text('{"id": "x"}')
+        file.symlink_to(tmp_path / "other")
+    elif content == "fifo":
+        os.mkfifo(file)
+    elif isinstance(content, bytes):
+        file.write_bytes(content)
+    else:
+        file.mkdir()
+    assert (box.releases.begin(), box.runs) == ("", NEW)
+    assert box.releases.trial
+    assert box.releases.trial.starts == 2
+
+
+def test_a_report_of_an_earlier_trial_counts_for_nothing(box: TrialBox):
+    """The same release on trial again begins anew, though it had passed, or had failed."""
+    box.start()
+    trial = box.releases.trial
+    assert trial
+    before = releases.ReleaseReport(trial.id, start=1)
+    for report in (replace(before, passed=True), replace(before, why="slow")):
+        releases.write_report(box.report, replace(report, id="another"))
+        box.start()
+        assert (box.runs, box.releases.trial is not None) == (NEW, True)
+
+
+def test_a_program_that_is_no_service_observes_no_trial(box: TrialBox):
+    """Nor does one of another release."""
+    assert box.start() is not None
+    assert release_trial.observed({}) is None
+    box._patch.setattr(sys, "prefix", str(box.opt / OLD))
+    assert release_trial.observed(box.env) is None
+    assert releases.text() == ""
+
+
+def test_a_release_with_nothing_to_go_back_to_stays(box: TrialBox):
+    """The folder of the one before was removed."""
+    for _ in range(3):
+        crash(box)
+    (box.opt / OLD).rmdir()
+    assert box.start() is not None
+    assert (box.runs, box.releases.rejected) == (NEW, {})
