@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cuts import black_box, calls, delivery, recording, scene, teaching, tree
+from tests.cuts import black_box, calls, delivery, recording, releases, scene, teaching, tree
 from tests.cuts.calls import NotFollowed
 from tests.cuts.scene import CrashPoint, CutScene, Found, ScenePlay, SceneStep
 
@@ -233,6 +233,16 @@ def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
     """Power cut at every moment of two runs: the last sweeps are there, never many more."""
     played = ScenePlay(black_box.scene(), work)
     assert wrong([played.power(moment) for moment in played.moments()]) == []
+
+
+@pytest.mark.thorough  # every moment of eleven commands
+def test_a_release_is_activated_and_sent_back_whole(work: Path):
+    """Power cut at every moment: the old release runs or the new one. The next release is taken, and
+    goes back to the proven one."""
+    played = ScenePlay(releases.scene(), work)
+    points = [played.power(moment) for moment in played.moments()]
+    assert wrong(points) == []
+    assert len(points) > 90
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from palpate.core.provenance import commit
-from tests.cuts import black_box, calls, delivery, memory, recording, teaching
+from tests.cuts import black_box, calls, delivery, memory, recording, releases, teaching
 from tests.cuts.scene import CrashPoint, CutScene, ScenePlay, stage
 from tests.factories.paths import ROOT
 
@@ -26,6 +26,7 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
     "black-box": lambda beside: black_box.scene(),
     "black-box-thread": lambda beside: black_box.scene("thread"),
     "memory": lambda beside: memory.scene(),
+    "releases": lambda beside: releases.scene(),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
     "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
     "teaching": lambda beside: teaching.TeachingShop.opened(beside).teaching(),

@@ -41,6 +41,8 @@ FAULTS = ("SEGV", "ABRT", "BUS", "ILL", "FPE", "TRAP", "SYS")
 counted as a start: a person or a lack of memory sends it."""
 
 
+SYSTEMD = Path("/run/systemd/system")
+"""It is there where systemd runs (sd_booted(3))."""
 RELOADED = (
     ("daemon-reload",),
     ("--no-block", "try-restart", "palpate@*", "palpate-watch", "palpate-bridge@*"),
@@ -161,9 +163,10 @@ class Releases:
         report = read_report(self._report, trial) if self._report else ReleaseReport(trial.id)
         boot = self._boot.read_text().strip()
         held = self._judged(trial, report, boot)
-        if report.passed and not report.why:
+        why = self.rejected.get(trial.release, [report.why])[0]
+        if report.passed and not why:
             self._end_trial()
-        elif why := report.why or _wrong(held):
+        elif why := why or _wrong(held):
             return self._send_back(trial, why)
         else:
             starts = held.starts + 1
@@ -234,15 +237,15 @@ def main(argv: list[str] | None = None, environ: Mapping[str, str] = os.environ)
     parser.add_argument("command", choices=("begin", "activate"))
     parser.add_argument("name", nargs="?", default="", help="the release, palpate-VERSION")
     parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--report", default=environ.get("STATE_DIRECTORY"))
     args = parser.parse_args(argv)
-    report = environ.get("STATE_DIRECTORY")
-    releases = Releases(args.folder, Path(report) if report else None)
+    releases = Releases(args.folder, Path(args.report) if args.report else None)
     try:
         if args.command == "activate":
             releases.activate(args.name)
         elif said := releases.begin():
             print(f"palpate: {said}", file=sys.stderr, flush=True)
-            for command in RELOADED:
+            for command in RELOADED if SYSTEMD.is_dir() else ():
                 subprocess.run(["systemctl", *command], check=False, timeout=30)
     except (ApplianceError, OSError) as e:
         print(f"palpate: {e}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Releases side by side: which one runs after installs, crashes, power-offs and faults."""
+"""Two releases: the release that runs after installs, crashes, power-offs and faults."""
 
 from __future__ import annotations
 
@@ -156,8 +156,8 @@ def failing(box: TrialBox) -> None:
 )
 def test_what_runs_after(box: TrialBox, events: list[Callable[[TrialBox], None]], runs: str):
     """Crashes, faults and failed sweeps send a release back; stops, unplugged skins and a month of
-    evenings at the mains switch do not. A release that was sent back says why, in what runs then,
-    and is refused until the list of rejected ones is removed."""
+    evenings at the mains switch do not. The old release then says why, and the new one is refused
+    until the list of rejected releases is removed."""
     for event in events:
         event(box)
         assert box.runs == NEW
@@ -198,7 +198,7 @@ def test_fifty_sweeps_and_a_day_of_streaming_end_the_trial(box: TrialBox):
 
 
 def test_a_second_release_on_trial_goes_back_to_the_proven_one(box: TrialBox):
-    """Not to the one that is on trial; and by hand the way back is no trial."""
+    """The release on trial is not proven. The proven release itself needs no trial."""
     box.start()
     box.releases.activate(NEXT)
     for event in (crash, crash, crash, stop):
@@ -269,7 +269,7 @@ def test_a_program_that_is_no_service_observes_no_trial(box: TrialBox):
 
 
 def test_a_release_with_nothing_to_go_back_to_stays(box: TrialBox):
-    """The folder of the one before was removed."""
+    """The folder of the old release was removed."""
     for _ in range(3):
         crash(box)
     (box.opt / OLD).rmdir()

@@ -230,8 +230,8 @@ def test_every_difference_is_told(in_service, default_bundle):
 def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
     in_service, default_bundle, monkeypatch
 ):
-    """The same program changes nothing, nor does a last bit. A program that reads counts 10 % too
-    high is told; sweeps of another bundle are left out."""
+    """The same program changes nothing, nor does a last bit. Counts that are read 10 % too high are
+    found. Sweeps of another bundle are left out."""
     folder, _ = in_service
     one_bit_off(at(folder, 4), "own")
     count, found = changed(folder, OTHERWISE, default_bundle)
