@@ -79,14 +79,15 @@ deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=
 WHEELS = rm -rf build/lib build/bdist.*; $(PIP) wheel --no-deps --no-build-isolation -w dist . \
   $(if $(filter 0,$(TEACH)),,&& $(PIP) wheel --no-deps --no-build-isolation -w dist ./train)
 
-install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, TEACH=0
+install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, KEY=FILE, TEACH=0
 	$(WHEELS)
 	$(BIN)/python systemd/install.py $(WHERE) $(if $(value BOARD),--board $(call quoted,BOARD)) \
-	  $(if $(value SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
+	  $(if $(value SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach) \
+	  $(if $(value KEY),--key $(call quoted,KEY))
 
 deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and amd64, a list of what is in it, and the notes
 	$(WHEELS)
-	$(BIN)/python systemd/debian.py dist
+	$(BIN)/python systemd/debian.py dist $(if $(value KEY),--key $(call quoted,KEY))
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 	awk '/^## / { part++ } part == 1' CHANGELOG.md >dist/notes.md
 

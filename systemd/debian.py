@@ -15,13 +15,16 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import install
+import own_signer
 from fleet import Failed
 from install import LINK, LINKS, MACHINES, PACKAGES, PATHS, SKINS, TEACHING, WHEEL
 from manual import write as write_manual
 from palpate import __version__
+from palpate.deployment.signature import own_key
 from release import ROOT, ReleaseArchives
 
 PYTHONS = ("3.11.2", "3.13.5")
@@ -75,7 +78,10 @@ def main() -> int:
     parser.add_argument(
         "--architectures", nargs="+", choices=MACHINES, default=[*MACHINES], metavar="ARCH"
     )
+    parser.add_argument("--key", type=Path, default=own_key(), metavar="FILE", help="signs them")
     args = parser.parse_args()
+    if args.key == own_key():
+        own_signer.line(partial(print, file=sys.stderr))  # makes the key
     for file in args.wheels:
         if not file.is_file():
             sys.exit(f"palpate: no file {file}; check the path (make deb builds the wheels)")
@@ -83,7 +89,7 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            archives = ReleaseArchives(args.wheels, [*PATHS, SKINS], Path(folder))
+            archives = ReleaseArchives(args.wheels, [*PATHS, SKINS], Path(folder), args.key)
             for architecture in args.architectures:
                 print(packed(archives, architecture, args.out), flush=True)
     except (Failed, OSError) as e:
@@ -205,7 +211,7 @@ esac
 echo "palpate: building {release}"
 ( {install.build(release)}
 ) < {ARCHIVES}/${{name#palpate-}}.tar
-( {install.prepare(release, "", "")}
+( {install.prepare(release, "")}
 )
 {install.self_test(release)}
 before=$(readlink {LINK} || true)

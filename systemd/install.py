@@ -13,6 +13,7 @@ import argparse
 import shlex
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import own_signer
@@ -22,7 +23,8 @@ from manual import write as write_manual
 from page_secrets import make as make_page_secrets
 from palpate import __version__
 from palpate.core.settings_files import boards
-from release import ROOT, ReleaseArchives
+from palpate.deployment.signature import own_key
+from release import NAMESPACE, ROOT, SUMS, ReleaseArchives
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
 TEACHING = ROOT / "dist" / "palpate_train-0.1.0-py3-none-any.whl"
@@ -123,6 +125,8 @@ def main(argv: list[str] | None = None) -> int:
         sys.exit(f"palpate: {e}")
     signers = args.signers.read_text() if args.signers else ""
     asks = bool(args.host) and sys.stdin.isatty()
+    if args.key == own_key():
+        own_signer.line(partial(print, file=sys.stderr))  # makes the key
     write_manual(ROOT / "build" / "manual.md")
 
     def one(box: FleetBox) -> str:
@@ -130,7 +134,7 @@ def main(argv: list[str] | None = None) -> int:
         return install(box, archives, board, signers)
 
     with tempfile.TemporaryDirectory() as folder:
-        archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder))
+        archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder), args.key)
         return each(args, one)
 
 
@@ -144,6 +148,13 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="allowed_signers: the signers whose bundles the box accepts",
+    )
+    parser.add_argument(
+        "--key",
+        type=Path,
+        default=own_key(),
+        metavar="FILE",
+        help="private key that signs the release; the boxes check it by their signers",
     )
     parser.add_argument(
         "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
@@ -203,6 +214,10 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         raise Failed(f"its Python is {python}; Palpate needs 3.11 or later, which Debian 12 has")
     name, archive = archives.of(machine, python)
     release = f"{LINK}-{name}"
+    if not signers and not box.run("looking for signers", f"cat {SIGNERS} 2> /dev/null || true"):
+        signers = own_signer.line(box.report)
+    if signers:
+        box.run("signers", put_signers(signers), user="root")
     if not box.run("looking for the release", f"cat {release}/stamp 2>/dev/null || true"):
         box.report(f"copying {name}, {archive.stat().st_size / 1e6:.0f} MB")
         box.put(archive, f".palpate-{name}.tar")
@@ -216,9 +231,7 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         )
     # also of an install that was interrupted after it had built
     box.run("tidying up", "rm -f .palpate-*.tar")
-    if not signers and not box.run("looking for signers", f"cat {SIGNERS} 2> /dev/null || true"):
-        signers = own_signer.line(box.report)
-    setup = prepare(release, board, signers)
+    setup = prepare(release, board)
     said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:
         box.report(line)
@@ -293,6 +306,7 @@ def build(release: str) -> str:
     return f"""set -e; umask 022
 exec 9> /run/palpate-install.lock; flock -w {BUILD_S} 9; ! [ -e {release}/stamp ] || exit 0
 rm -rf {release}; mkdir {release}; tar -x --no-same-owner -C {release}
+{check_signature(release)}
 python3 -m venv {release}
 {release}/bin/python {PIP} --find-links {release}/wheels --require-hashes \\
   -r {release}/wheels/requirements.lock
@@ -304,6 +318,36 @@ rm -r {release}/wheels
 sync -f {release}
 echo {Path(release).name} > {release}/stamp
 sync -f {release}"""
+
+
+def check_signature(release: str, signers: str = SIGNERS) -> str:
+    """Commands that end the shell with an error unless a signer of the box has signed all files of
+    the unpacked archive. A box without signers, on which a Debian package is installed for the
+    first time, trusts it as dpkg does."""
+    sums = f"{release}/{SUMS}"
+    verify = f"ssh-keygen -Y verify -f {signers} -n {NAMESPACE} -s {sums}.sig"
+    return f"""if [ -s {signers} ]; then
+  by=$(ssh-keygen -Y find-principals -f {signers} -s {sums}.sig 2> /dev/null | head -n 1) || true
+  [ -n "$by" ] && {verify} -I "$by" < {sums} > /dev/null \
+    || {{ echo 'nobody in {signers} has signed the release; use a key from there: KEY=FILE' >&2
+      exit 1; }}
+  (cd {release} && sha256sum --status --strict -c {SUMS} \
+    && [ -z "$(find . ! -type f ! -type d)" ] \
+    && [ "$(find . -type f | wc -l)" = $(($(wc -l < {SUMS}) + 2)) ]) \
+    || {{ echo 'the release differs from what was signed; install it again' >&2; exit 1; }}
+else
+  echo 'no signers in {signers}: the signature of the release is not checked' >&2
+fi"""
+
+
+def put_signers(signers: str, file: str = SIGNERS) -> str:
+    """Commands that write the file of signers if there is none; another one there is an error."""
+    text = shlex.quote(signers)
+    return f"""set -e; umask 022; mkdir -p {Path(file).parent}
+if [ ! -e {file} ]; then {_put(file, text)}
+elif [ "$(cat {file}; echo .)" != {text}. ]; then
+  echo '{file} differs from this file there, and stays; change it on the box' >&2; exit 1
+fi"""
 
 
 def _set_board(board: str, share: str) -> str:
@@ -320,7 +364,7 @@ if [ -n "$board" ] && ! grep -qxF "$line" {SETTINGS} 2> /dev/null; then
 fi"""
 
 
-def prepare(release: str, board: str, signers: str) -> str:
+def prepare(release: str, board: str) -> str:
     """Commands that set up users, folders, settings and links outside of the release, and print a
     line for each file that was there and for a changed board. The old release can run with them,
     too."""
@@ -332,14 +376,6 @@ def prepare(release: str, board: str, signers: str) -> str:
         make_page_secrets(),
         make_enrolment_key(),
     ]
-    if signers:
-        file, text = SIGNERS, shlex.quote(signers)
-        lines += [
-            f'if [ ! -e {file} ]; then {_put(file, text)}; elif [ "$(cat {file}; echo .)" != '
-            f"{text}. ]; then"
-            f" echo '{file} differs from this file there, and stays; change it on the box' >&2; "
-            "exit 1; fi"
-        ]
     lines.append(_set_board(board, share))
     for path, target in LINKS.items():
         settings = path.startswith("/etc/palpate/")

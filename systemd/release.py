@@ -8,6 +8,7 @@ internet.
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 import subprocess
 import sys
@@ -22,10 +23,14 @@ from packaging.requirements import Requirement
 from fleet import Failed
 from palpate import __version__
 from palpate.core import storage
+from palpate.core.errors import ApplianceError
+from palpate.deployment import signature
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCK, TEACH_LOCK = (ROOT / "appliance" / name for name in ("requirements.lock", "teach.lock"))
 """Libraries of the box, and the same with those of teaching at the robot."""
+SUMS, NAMESPACE = "SHA256SUMS", "palpate-release"
+"""The list of an archive's files, and the namespace of its signature."""
 GLIBC = 36
 """Newest glibc, 2.36 of Debian 12, that a wheel may need."""
 
@@ -35,11 +40,14 @@ class ReleaseArchives:
     the first box needs it.
 
     wheels: of Palpate, and of palpate-train if the boxes can be taught. shares: files and folders
-    of this checkout that are packed too. folder: where the archives are written.
+    of this checkout that are packed too. folder: where the archives are written. key: it signs the
+    list of all files and their hashes (SUMS), which the box checks before it installs them.
     """
 
-    def __init__(self, wheels: Sequence[Path], shares: Sequence[str], folder: Path) -> None:
-        self._wheels = wheels
+    def __init__(
+        self, wheels: Sequence[Path], shares: Sequence[str], folder: Path, key: Path
+    ) -> None:
+        self._wheels, self._key = wheels, key
         self._shares = [ROOT / name for name in shares if (ROOT / name).exists()]
         self._folder = folder
         self._lock = Lock()
@@ -68,11 +76,28 @@ class ReleaseArchives:
         name = f"{__version__}-{content.hexdigest()[:8]}"
         archive = self._folder / f"{name}-{machine}.tar"
         wheels = fetch(lock, python, machine)
+        packed = {f"wheels/{f.name}": f for f in (*sorted(wheels.iterdir()), *self._wheels)}
+        for share in self._shares:
+            packed |= {
+                f"share/palpate/{file.relative_to(share.parent)}": file
+                for file in (share, *share.rglob("*"))
+                if file.is_file()
+            }
+        sums = "".join(
+            f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {name}\n"
+            for name, file in packed.items()
+        ).encode()
+        try:
+            signed = {SUMS: sums, f"{SUMS}.sig": signature.sign(sums, self._key, NAMESPACE)}
+        except ApplianceError as e:
+            raise Failed(str(e)) from e
         with tarfile.open(archive, "w") as tar:
-            for file in (*sorted(wheels.iterdir()), *self._wheels):
-                tar.add(file, f"wheels/{file.name}", filter=_plain)
-            for share in self._shares:
-                tar.add(share, f"share/palpate/{share.name}", filter=_plain)
+            for name_in, data in signed.items():
+                member = tarfile.TarInfo(name_in)
+                member.size = len(data)
+                tar.addfile(_plain(member), io.BytesIO(data))
+            for name_in, file in packed.items():
+                tar.add(file, name_in, filter=_plain)
         return name, archive
 
 

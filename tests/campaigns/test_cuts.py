@@ -237,7 +237,7 @@ def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
 
 @pytest.mark.thorough  # every moment of eleven commands
 def test_a_release_is_activated_and_sent_back_whole(work: Path):
-    """Power cut at every moment: the old release runs or the new one. The next release is taken, and
+    """Power cut at every moment: the old release runs, or the new. The next release is taken, and
     goes back to the proven one."""
     played = ScenePlay(releases.scene(), work)
     points = [played.power(moment) for moment in played.moments()]

@@ -55,7 +55,7 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
     """Installs the first host over loopback, as a user without a profile; the output of that."""
     (site.work / "signers").write_text(deliveries.line(deliveries.key(site.work / "keys")))
     words = ("--host", f"{hosts.USER}@127.0.0.1", "--wheel", wheel, "--board", "rpi5")
-    signers = ("--signers", site.work / "signers")
+    signers = ("--signers", site.work / "signers", "--key", site.work / "keys" / "key")
     done = site.desktop("install", *words, *signers, inside=site.hosts[0])
     assert done.returncode == 0, done.stdout + done.stderr
     # reported, not changed silently
@@ -87,7 +87,8 @@ class DeployedBox:
         self, command: str, *args: str | Path, code: int = 0
     ) -> subprocess.CompletedProcess[str]:
         """Run `install --wheel WHEEL ...` or `deploy BUNDLE ...` for it, which ends with `code`."""
-        words = (*self.at, *(["--wheel"] if command == "install" else []), *args)
+        signed = ("--key", self.site.work / "keys" / "key", "--wheel")
+        words = (*self.at, *(signed if command == "install" else ()), *args)
         done = self.site.desktop(command, *words)
         assert done.returncode == code, done.stdout + done.stderr
         return done
@@ -273,7 +274,8 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     """Cut during the copy or the build: the old release starts, a second call ends it."""
     new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
     before = box.release()
-    box.site.cut("install", *box.at, "--wheel", new, words=said, after_s=after_s)
+    key = ("--key", box.site.work / "keys" / "key")
+    box.site.cut("install", *box.at, *key, "--wheel", new, words=said, after_s=after_s)
     assert box.release() == before
     box.start_again()
     box.does("install", new)

@@ -2,10 +2,13 @@
 
 import os
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from palpate.deployment import signature
+from tests.factories import deliveries
 from tests.factories.install_scripts import require_pyinfra, run_here
 
 require_pyinfra()
@@ -131,3 +134,68 @@ def test_a_delivery_raises_the_counter_of_root(tmp_path: Path, before: str | Non
     shell(run_here(f"import deploy; print(deploy.raised(7, {str(file)!r}))"))
     assert file.read_text().strip() == after
     assert [*tmp_path.iterdir()] == [file]
+
+
+def unpacked(folder: Path, key: Path) -> Path:
+    """A release as it is unpacked on a box, signed by a key. sums: more lines of its list."""
+    release = folder / "palpate-1"
+    (release / "wheels").mkdir(parents=True)
+    (release / "wheels" / "palpate.whl").write_bytes(b"program")
+    shell(f"cd {release} && sha256sum wheels/palpate.whl > SHA256SUMS")
+    text = (release / "SHA256SUMS").read_bytes()
+    (release / "SHA256SUMS.sig").write_bytes(signature.sign(text, key, "palpate-release"))
+    return release
+
+
+def others(release: Path) -> None:
+    """Sign as another person."""
+    key = deliveries.key(release.parent / "others")
+    signed = signature.sign((release / "SHA256SUMS").read_bytes(), key, "palpate-release")
+    (release / "SHA256SUMS.sig").write_bytes(signed)
+
+
+def for_bundles(release: Path) -> None:
+    """Sign as a bundle is signed."""
+    signed = signature.sign((release / "SHA256SUMS").read_bytes(), release.parent / "keys" / "key")
+    (release / "SHA256SUMS.sig").write_bytes(signed)
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], int]] = {
+    "as signed": (lambda r: None, 0),
+    "another wheel": (lambda r: (r / "wheels" / "palpate.whl").write_bytes(b"PROGRAM"), 1),
+    "a file more": (lambda r: (r / "palpate.service").touch(), 1),
+    "a link more": (lambda r: (r / "share").symlink_to("/etc"), 1),
+    "a file less": (lambda r: (r / "wheels" / "palpate.whl").unlink(), 1),
+    "no signature": (lambda r: (r / "SHA256SUMS.sig").unlink(), 1),
+    "a list of others": (others, 1),
+    "the signature of a bundle": (for_bundles, 1),
+    "an empty list": (lambda r: (r / "SHA256SUMS").write_bytes(b""), 1),
+}
+
+
+@pytest.mark.slow
+@deliveries.NEEDED
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_box_installs_what_a_signer_of_it_has_signed(tmp_path: Path, what: str):
+    """Every file of the archive, and no other file."""
+    key = deliveries.key(tmp_path / "keys")
+    (tmp_path / "signers").write_text(deliveries.line(key))
+    release = unpacked(tmp_path, key)
+    change, code = CHANGES[what]
+    change(release)
+    script = run_here(
+        f"import install; print(install.check_signature({str(release)!r}, "
+        f"{str(tmp_path / 'signers')!r}))"
+    )
+    done = subprocess.run(["sh", "-ec", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == code, done.stderr
+    assert bool(done.stderr) == bool(code)
+
+
+@pytest.mark.slow
+def test_a_box_without_signers_says_that_nothing_was_checked(tmp_path: Path):
+    """As when a Debian package is the first that comes."""
+    where = f"{str(tmp_path)!r}, {str(tmp_path / 'none')!r}"
+    script = run_here(f"import install; print(install.check_signature({where}))")
+    done = subprocess.run(["sh", "-ec", script], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, "not checked" in done.stderr) == (0, True)
