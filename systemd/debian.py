@@ -237,6 +237,7 @@ def _comes_up() -> str:
   echo "palpate: installed; it needs a setting in {install.SETTINGS}, see the line above"
   exit 0
 fi
+[ "$(readlink {LINK})" = "$name" ] || fail "$name failed its trial; palpate status says why"
 {install.tidy()}
 systemctl try-restart 'palpate@*' palpate-watch 'palpate-bridge@*' || true
 if [ "$state" = active ]; then

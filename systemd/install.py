@@ -423,6 +423,8 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
         ready = _start(box)
     except Failed as e:
         raise Failed(f"{e}{_swap_back(box, release)}") from e
+    if (now := box.run("asking what runs", f"readlink {LINK}")) != Path(release).name:
+        raise Failed(f"{name} failed its trial, so {now} runs again; palpate status there says why")
     # until then they belong to the earlier release; disabled units stay off
     box.run(
         "restarting page and bridges",

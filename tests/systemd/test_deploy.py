@@ -86,7 +86,10 @@ class DeployedBox:
     def does(
         self, command: str, *args: str | Path, code: int = 0
     ) -> subprocess.CompletedProcess[str]:
-        """Run `install --wheel WHEEL ...` or `deploy BUNDLE ...` for it, which ends with `code`."""
+        """Run `install --wheel WHEEL ...` or `deploy BUNDLE ...` for it, which ends with `code`.
+        The release that it has is proven before an install."""
+        if command == "install":
+            self.machine.run("rm", "-f", "/opt/palpate.trial")
         signed = ("--key", self.site.work / "keys" / "key", "--wheel")
         words = (*self.at, *(signed if command == "install" else ()), *args)
         done = self.site.desktop(command, *words)
@@ -283,17 +286,17 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     assert box.service["ActiveState"] == "active"
 
 
-def test_a_new_release_is_on_trial_and_the_old_one_is_not(
-    box: DeployedBox, upgraded: list[tuple[str, str]], wheel: Path
+def test_a_release_that_was_sent_back_is_refused(
+    box: DeployedBox, upgraded: list[tuple[str, str]], wheel: Path, tmp_path: Path
 ):
-    """Swapped back by hand at once; one that was sent back is refused by name."""
-    trial = json.loads(box.get("cat", "/opt/palpate.trial"))
-    assert trial["release"] == box.release()
-    assert trial["back"] == box.get("readlink", "/opt/palpate.previous")
-    box.machine.put("/opt/palpate.rejected", json.dumps({"palpate-x": ["slow", trial["back"]]}))
-    activate = run_here(f"import install; print(install.swap('/opt/{trial['back']}'))")
-    refused = box.machine.run("sh", "-c", activate.replace(trial["back"] + ")", "palpate-x)"))
-    assert (refused.returncode, "slow" in refused.stderr) == (78, True)
+    """A new release is on trial, and dies: the box goes back by itself, the desktop says so, and
+    the same release is refused then."""
+    before, dies = box.release(), "\nimport os\nNotifier.turn = lambda *_: os.abort()\n"
+    broken = changed(wheel, tmp_path, "palpate/service/systemd.py", dies)
+    assert f"failed its trial, so {before} runs again" in box.does("install", broken, code=1).stdout
+    box.service.until("ActiveState", "active")
+    assert box.release() == before
+    assert "was sent back" in box.does("install", broken, code=1).stdout
     box.get("rm", "/opt/palpate.rejected")
 
 
