@@ -156,8 +156,8 @@ def failing(box: TrialBox) -> None:
 )
 def test_what_runs_after(box: TrialBox, events: list[Callable[[TrialBox], None]], runs: str):
     """Crashes, faults and failed sweeps send a release back; stops, unplugged skins and a month of
-    evenings at the mains switch do not. The old release then says why, and the new one is refused
-    until the list of rejected releases is removed."""
+    evenings at the mains switch do not. The old release then says why. The new release is refused
+    until its rejection is removed."""
     for event in events:
         event(box)
         assert box.runs == NEW
