@@ -32,15 +32,14 @@ On two simulated worlds and three materials, left out with a third of the positi
 98 and 99.7 % of known sweeps, and give 1, 2 and 7 % of unknown ones a label."""
 MOST_UNKNOWN = 0.15
 """Largest share of held-out sweeps that a bundle may call unknown: export refuses it else."""
-LEAST_KEPT = {"strict": 0.5, "balanced": 0.75, "loose": 0.9}
+LEAST_KEPT = {"strict": 0.5, "balanced": 0.5, "loose": 0.9}
 MOST_KEPT = 0.995
 """Least share of known sweeps within each limit, and the largest, at any cost. A box that refuses
-more is of no use; a wider limit only lets strangers in. A left-out value of few refuses more than a
-new one: where 75 % of sweeps under a left-out speed are within, 98 % under a new one are; with a
-least share of 0.9 it would be 99.8 %, but 84 instead of 50 % of unknown ones (seven fabrics)."""
-LEAST_BY_JUNK = LEAST_KEPT | {"balanced": 0.85}
-"""The same with junk, for few sweeps: these say too little of strangers to give up known sweeps for
-them."""
+more is of no use; a wider limit only lets strangers in."""
+FEW_SWEEPS, LEAST_OF_FEW = 50, 0.85
+"""Up to this number of sweeps of a material, the balanced limit keeps this share. They say too
+little of strangers to give up known sweeps for them, and their cross-fits are farther away than new
+sweeps of the finished model."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""
@@ -158,7 +157,9 @@ def limits(
     grid = np.linspace(every.min() - reach, every.max() + reach, STEPS)
     kept, named = (_share_below(grid, one.by_material) for one in (known, strangers))
     made = [_log(distances) for distances in junk.values()]
-    wrong, least_kept = named + _share_below(grid, made), LEAST_BY_JUNK if made else LEAST_KEPT
+    wrong, least_kept = named + _share_below(grid, made), dict(LEAST_KEPT)
+    if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
+        least_kept["balanced"] = LEAST_OF_FEW
     most, chosen = int(np.argmax(kept >= MOST_KEPT)), {}
     for name, cost in COSTS.items():
         cheapest = _cheapest(kept, wrong, stranger_cost * cost)
