@@ -91,7 +91,7 @@ def test_neither_a_cross_fit_nor_junk_closes_the_box():
     assert np.mean(far.learned <= limits({"force": inflated}).loose) < 0.5
     assert (far.corrected()[0] >= np.log(far.learned)).all()
     junk = {"mixed": np.full(60, np.exp(-4.0))}
-    found = limits({"force": left_out(400)}, 1e6, junk)
+    found = limits({"force": left_out(160)}, 1e6, junk)
     assert found.figures["balanced"]["answered"][0] >= 0.75
 
 
