@@ -158,38 +158,6 @@ def test_the_mean_of_tests_counts_one_set_once(files: tuple[str, str], away: flo
     assert middle == pytest.approx((0.8, 0.8 - away, 0.8 + away))
 
 
-def test_a_form_of_a_method_has_a_spot_of_its_own():
-    """With its own time and accuracy, in the quicker of two libraries; without an accuracy none."""
-    results = [
-        entry("one", "ds-cnn", 0.7) | {"forms": {"int8": entry("one", "ds-cnn", 0.6)}},
-        entry("one", "lite", 0.7),
-    ]
-    costs = [
-        timed(name, ms, form or "float", form)
-        for name in ("ds-cnn", "lite")
-        for form, ms in (("", 1.0), ("int8", 0.5), ("", 0.9))
-    ]
-    (made,) = development_chart.panels(figures(results=results, times=times(*costs)))
-    assert [(one.method, one.form, one.ms, one.mean) for one in made.whole] == [
-        ("ds-cnn", "int8", 0.5, 0.6),
-        ("ds-cnn", "", 0.9, 0.7),
-        ("lite", "", 0.9, 0.7),
-    ]
-
-
-def test_a_panel_has_the_times_of_its_own_sweeps():
-    """A model that sees more on fabrics takes longer there than on the simulated skin."""
-    own = times(timed("palpate", 0.4)) | {"format": "16x1 int16 at 36 Hz, window 128"}
-    made = figures(
-        cases=[case("one"), case(SERIES)],
-        results=[entry(c, "palpate", 0.9) for c in ("one", SERIES)],
-        times=times(timed("palpate", 0.1)),
-        panel_times={development_chart.TACTILE: own},
-    )
-    assert [panel.whole[0].ms for panel in development_chart.panels(made)] == [0.4, 0.1]
-    assert any("16x1 taxels, 128 frames" in text for text in texts(development_report.front(made)))
-
-
 def test_cases_and_methods_exist_and_have_words_for_people():
     """No protocol, published set or described method is shown by its name in commands."""
     usual = set(development_experiment.usual_methods(development_experiment.STUDY))

@@ -159,22 +159,6 @@ def test_results_are_finite_for_any_counts(taxels, rate_hz):
 
 
 @pytest.mark.parametrize(
-    ("frames", "rate_hz", "shape"),
-    [
-        (1500, 750.0, (40, 19)),
-        (1499, 750.0, (39, 19)),
-        (75, 750.0, (2, 19)),
-        (200, 100.0, (40, 3)),
-        (3000, 1500.0, (40, 19)),
-    ],
-)
-def test_the_number_of_h_features_follows_from_frames_and_rate(frames, rate_hz, shape):
-    """Whole steps of 0.05 s times bands of 20 Hz up to Nyquist."""
-    assert features.h_shape(frames, rate_hz) == shape
-    assert len(features.h_features(np.ones((frames, 1, 1), np.uint8), rate_hz)) == math.prod(shape)
-
-
-@pytest.mark.parametrize(
     ("kind", "shape", "rate_hz", "message"),
     [
         ("MFCC", (80, 4, 4), 750.0, "'MFCC' is unknown"),

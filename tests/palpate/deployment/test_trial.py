@@ -296,6 +296,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box):
         box.store.install(box.made(2))
 
 
+@pytest.mark.slow
 def test_a_box_at_work_commits(box, rigged):
     """On the simulated box: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()

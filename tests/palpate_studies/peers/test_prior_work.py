@@ -60,20 +60,6 @@ def test_a_spectrogram_is_its_formula():
     np.testing.assert_allclose(spectrogram(x, RATE).reshape(5, 25)[1], want)
 
 
-def test_load_and_place_are_those_of_the_normal_axis():
-    """Shear only adds its means and deviations, and power weighted by the taxel's load."""
-    x = noise()
-    shear = np.random.default_rng(8).normal(-300, 9, (*x.shape, 2)).astype(np.float32)
-    three = np.concatenate([shear, x[..., None]], axis=-1)
-    np.testing.assert_allclose(static(three, RATE)[-7:], static(x, RATE)[-7:])
-    np.testing.assert_allclose(
-        static(three, RATE)[:36].reshape(2, 6, 3)[..., 2], static(x, RATE)[:12].reshape(2, 6)
-    )
-    same = np.stack([x, x, x], axis=-1)
-    np.testing.assert_allclose(spectrogram(same, RATE), spectrogram(x, RATE))
-    np.testing.assert_allclose(correlation(same, RATE)[:3], correlation(x, RATE)[:3])
-
-
 @pytest.mark.parametrize(("frames", "band"), [(1500, 7), (128, 3), (100, 20)])
 def test_a_tone_lands_in_its_part_and_band(frames: int, band: int):
     """A burst in the fourth fifth is the maximum there, also where zeros are appended."""

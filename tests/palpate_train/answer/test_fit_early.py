@@ -187,21 +187,6 @@ def test_the_graph_gives_what_training_computed(made):
         assert np.allclose(have, done.probabilities(x[i : i + 1])[0], atol=1e-3)
 
 
-def test_a_graph_without_tenths_has_no_early_heads(made):
-    """Without prefixes or without a rule there are only logits and embedding."""
-    done, x, counts, _, _ = made
-    for model in (
-        bundle_graph(done, trunk(FORMAT)),
-        bundle_graph(
-            replace(done, rule=fit_early.EarlyRule(None, "why")), trunk(FORMAT), trunk(FORMAT, True)
-        ),
-    ):
-        assert [o.name for o in model.graph.output] == ["logits", "embedding"]
-        assert np.allclose(
-            softmax(run(model, counts[:2])), softmax(done.logits(x[:2, -1])), atol=1e-3
-        )
-
-
 def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
     """Without `early` the rest is, byte for byte, the model that was made without prefixes."""
     done, _, _, _, whole = made

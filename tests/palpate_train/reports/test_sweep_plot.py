@@ -97,15 +97,6 @@ def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
     assert "grey" not in words(found)
 
 
-def test_the_picture_does_without_what_is_not_known(tmp_path: Path):
-    """A recording of an older version with a short sidecar shows no rest, verdict or device."""
-    record(tmp_path / "1.npy", "a")
-    shown = words(sweep_plot.draw(sweep_plot.load(str(tmp_path / "1.npy"))))
-    assert shown.startswith("a\n1.npy, sweep 1: ok")
-    for text in ("rest", "verdict", "bundle", "device", "clock", "lost", "None"):
-        assert text not in shown
-
-
 @pytest.mark.parametrize("side", [4, 12])
 def test_the_picture_is_whole_and_needs_nothing(tmp_path: Path, side: int):
     """It has a title, plain colours, one image, and is the same when drawn twice."""
