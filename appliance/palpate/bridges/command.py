@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from palpate.bridges.options import FEED_KINDS, LINKS, MOST, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
@@ -43,10 +43,8 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         args.listen = f"{bridge.address}:{PORTS[kind]}"
     for name in SETTINGS:
         setattr(args, name, getattr(args, name, None) or getattr(bridge, name))
-    args.folder, args.memory = (
-        getattr(args, "folder", None) or Path(bridge.opcua),
-        Path(bridge.memory),
-    )
+    args.folder = getattr(args, "folder", None) or Path(bridge.opcua)
+    args.memory = Path(bridge.memory)
     if args.port or args.link or args.feed:
         return
     if settings.serial.port == LINKS[kind]:
@@ -71,19 +69,9 @@ def _needed(what: str, extra: str) -> Iterator[None]:
         raise ConfigError(f"{what} is not installed ({e}); pip install 'palpate[{extra}]'") from e
 
 
-class BridgeServer(Protocol):
-    """A server."""
-
-    address: tuple[str, int]
-
-    async def open(self, host: str, port: int) -> None:
-        """Listen. Raises AddressError or ConfigError."""
-
-
-Served = tuple[
-    BridgeServer, str, Callable[[], Awaitable[None]], Callable[[], Awaitable[None] | None]
-]
-"""A bridge as a server: itself, the name of the box, its work once a second, and what closes it."""
+Served = tuple[Any, str, Callable[[], Awaitable[None]], Callable[[], Awaitable[None] | None]]
+"""A bridge as a server: itself, with `open` and `address` as TcpServer has them, the name of the
+box, its work once a second, and what closes it."""
 
 
 def _modbus(args: argparse.Namespace) -> Served:
@@ -156,7 +144,8 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
         try:
             await server.open(host, port)
             _say(args, server, box)
-            ends.append(network.announce(args.kind, *server.address, args.name))
+            own, at = server.address  # port 0 has become one of its own
+            ends.append(network.announce(args.kind, own, at, args.name))
             await until(stop, EVERY_S, work)
         finally:
             for end in ends:
@@ -316,7 +305,7 @@ def run(args: argparse.Namespace) -> int:
     return RUNS[args.kind](args)
 
 
-def _say(args: argparse.Namespace, server: BridgeServer, box: str) -> None:
+def _say(args: argparse.Namespace, server: Any, box: str) -> None:
     at = f"{args.kind}: listening on {':'.join(map(str, server.address))}, box at {box}"
     if not args.allow_writes:
         log.info(f"{at}; commands are refused (--allow-writes)")

@@ -60,12 +60,11 @@ class _Wanted:
 
     def end(self) -> None:
         """Add what waits for nodes that came later."""
-        while len(rest := [*self._service.try_add_nodes(self._nodes, check=False)]) < len(
-            self._nodes
-        ):
-            self._nodes = rest
-        for _ in self._service.try_add_references(self._references):
-            pass
+        before = -1
+        while before != len(self._nodes):
+            before = len(self._nodes)
+            self._nodes = [*self._service.try_add_nodes(self._nodes, check=False)]
+        list(self._service.try_add_references(self._references))
 
 
 def _wanted(node: Any) -> bool:

@@ -20,14 +20,11 @@ READ_S = 0.5
 browsers see that this program runs."""
 
 
-Found = Callable[[], Sequence[Mapping[str, str]]]
-"""Other boxes of the site, each with `name` and `address` of its page."""
-
-
 class PageWatcher:
     """The pages of `palpate watch --web` at `access`, for the feed at `path`. now_ns: the clock of
     the box's time stamps. finger: the unit of several fingers, "" for a box with one. found: lists
-    other boxes. Raises ConfigError if the address cannot be used."""
+    other boxes, each with `name` and `address`. Raises ConfigError if the address cannot be
+    used."""
 
     def __init__(
         self,
@@ -36,7 +33,7 @@ class PageWatcher:
         now_ns: Callable[[], int],
         history: History,
         finger: str = "",
-        found: Found = tuple,
+        found: Callable[[], Sequence[Mapping[str, str]]] = tuple,
     ) -> None:
         self.feed, self.history, self._now_ns = Feed(path, sweeps=True), history, now_ns
         answers: dict[str, Answer] = {
