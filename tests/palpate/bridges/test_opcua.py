@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import ConfigError
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.speaking_box import SpeakingBox, result, state
+from tests.robots.attackers import HELLO
 
 opcua_security = pytest.importorskip(
     "palpate.bridges.opcua_security", reason="palpate[opcua] is not installed"
@@ -238,6 +240,11 @@ def test_hostile_bytes(box, folder, caplog):
                     pass
             box.say(state())
             assert client.nodes.server.get_children()
+        for _ in range(50):  # asks much, and goes before the answers
+            one = socket.create_connection(("127.0.0.1", port), timeout=LONG_S)
+            one.sendall(HELLO * 50)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            one.close()
         silent = [socket.create_connection(("127.0.0.1", port), timeout=LONG_S) for _ in range(40)]
         assert client.nodes.server.get_children()
         for one in silent:
