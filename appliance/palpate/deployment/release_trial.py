@@ -73,7 +73,10 @@ def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:
     before = releases.read_report(folder, trial)
     if before.passed:
         return None
-    begun = replace(before, start=trial.start, quiet=False, worked=False)
-    standing = Standing(sweeps=before.sweeps, streamed_s=before.streamed_s)
+    sweeps, s = trial.sweeps, trial.streamed_s
+    begun = replace(
+        before, start=trial.start, quiet=False, worked=False, sweeps=sweeps, streamed_s=s
+    )
+    standing = Standing(sweeps=sweeps, streamed_s=s)
     store = ReportStore(folder, begun)
     return ReleaseTrial(store, trial.release, f"release {trial.release}", standing)

@@ -28,7 +28,7 @@ from palpate.core import storage
 from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.schema import typed
 from palpate.core.text import printable
-from palpate.deployment.state import MOST_CUTS, MOST_STARTS, MOST_WHY, Standing
+from palpate.deployment.state import MOST_CUTS, MOST_STARTS, MOST_WHY, Standing, TrialProgress
 
 FOLDER, NAME = Path("/opt"), "palpate"
 """Folder of the releases and of the link, and the name of the link."""
@@ -54,7 +54,8 @@ the release that runs now."""
 @dataclass(frozen=True, slots=True)
 class RootState:
     """Root's part of a trial. release: the folder's name. back: the release to go back to. id: of
-    this trial. start: the number of starts. starts, boot, cuts: as in Standing."""
+    this trial. start: the number of starts. starts, boot, cuts, sweeps, streamed_s: as in
+    Standing."""
 
     release: str
     back: str
@@ -63,13 +64,16 @@ class RootState:
     starts: int = 0
     boot: str = ""
     cuts: int = 0
+    sweeps: int = 0
+    streamed_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseReport:
     """The service's part of a trial. id, start: of RootState, at the last start. quiet: whether
-    this start counts for nothing. sweeps, streamed_s, worked: as in Standing. passed: the goal was
-    reached. why: the fault that sends the release back, "" without a fault."""
+    this start counts for nothing. sweeps, streamed_s: progress with this start. worked: as in
+    Standing. passed: the goal was reached. why: the fault that sends the release back, "" without
+    a fault."""
 
     id: str
     start: int = 0
@@ -169,22 +173,30 @@ class Releases:
         elif why := why or _wrong(held):
             return self._send_back(trial, why)
         else:
-            starts = held.starts + 1
-            begun = replace(trial, start=trial.start + 1, starts=starts, boot=boot, cuts=held.cuts)
+            begun = replace(
+                trial,
+                start=trial.start + 1,
+                starts=held.starts + 1,
+                boot=boot,
+                cuts=held.cuts,
+                sweeps=held.sweeps,
+                streamed_s=held.streamed_s,
+            )
             storage.put(self._trial, _json(asdict(begun)), mode=0o644)
         return ""
 
     def _judged(self, trial: RootState, report: ReleaseReport, boot: str) -> Standing:
         """The state before a start, once the last start has been judged by its report."""
-        mine = report.start == trial.start
+        mine, quiet = report.start == trial.start, report.quiet and trial.start > 0
         held = Standing(
-            *(trial.back, 0, False, trial.starts),
+            *(trial.back, 0, False, trial.starts, trial.sweeps, trial.streamed_s),
             boot=trial.boot,
-            worked=mine and report.worked,
             cuts=trial.cuts,
         )
-        if mine and report.quiet and trial.start:
-            held = replace(held, starts=max(0, held.starts - 1), boot="")
+        if mine:
+            starts = max(0, trial.starts - quiet)
+            now = TrialProgress(starts, report.sweeps, report.streamed_s, report.worked)
+            held = held.noted(now, "" if quiet else trial.boot)
         return held.since(boot)
 
     def _send_back(self, trial: RootState, why: str) -> str:

@@ -59,7 +59,9 @@ class Standing:
     previous: the bundle to go back to while this bundle is current.
     counter: of its manifest.
     starts: number of starts on trial without an orderly end.
-    sweeps, streamed_s: progress of its trial, as of the last write.
+    sweeps, streamed_s: progress of its trial without the last start.
+    last_sweeps, last_s: the same with the last start, as of the last write. They hold if a power
+    cut or an orderly end has ended that start, and are lost if the program has failed.
     why: why its trial failed, "" if it did not.
     boot: id of the boot of the last counted start, "" if that start is no longer counted.
     worked: whether the last start has made progress.
@@ -77,6 +79,8 @@ class Standing:
     boot: str = ""
     worked: bool = False
     cuts: int = 0
+    last_sweeps: int = 0
+    last_s: float = 0.0
 
     def since(self, boot: str) -> Standing:
         """The state at a start in this boot. If the last counted start was in another boot, the end
@@ -84,9 +88,29 @@ class Standing:
         no progress."""
         cuts = 0 if self.worked else self.cuts
         if not self.boot or not boot or self.boot == boot:
-            return replace(self, cuts=cuts)
+            return replace(self, cuts=cuts, last_sweeps=0, last_s=0.0)
         cuts += not self.worked
-        return replace(self, starts=self.starts - 1, cuts=cuts, boot="")
+        return replace(self._settled(), starts=self.starts - 1, cuts=cuts, boot="")
+
+    def noted(self, progress: TrialProgress, boot: str) -> Standing:
+        """The state with the progress of a start. boot: "" if the start does not count, so that its
+        progress holds. Less progress than before holds, too: the trial has begun anew."""
+        made = replace(
+            self,
+            starts=progress.starts,
+            worked=progress.worked,
+            boot=boot,
+            sweeps=min(self.sweeps, progress.sweeps),
+            streamed_s=min(self.streamed_s, progress.streamed_s),
+            last_sweeps=progress.sweeps,
+            last_s=progress.streamed_s,
+        )
+        return made if boot else made._settled()
+
+    def _settled(self) -> Standing:
+        """The state in which the progress of the last start holds whatever comes."""
+        sweeps, s = max(self.sweeps, self.last_sweeps), max(self.streamed_s, self.last_s)
+        return replace(self, sweeps=sweeps, streamed_s=s, last_sweeps=0, last_s=0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -282,7 +282,7 @@ class Store:
         Does not wait: raises ApplianceError if another command holds the lock."""
         boot = self._boot if counted else ""
         with self._locked(0.0) as state:
-            self._write(state.changed(sha, boot=boot, **progress._asdict()))
+            self._write(state.changed(sha, **asdict(state.of(sha).noted(progress, boot))))
 
     def _committed(self, sha: str) -> Choice:
         """A committed bundle for this start."""

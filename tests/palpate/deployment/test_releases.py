@@ -197,6 +197,22 @@ def test_fifty_sweeps_and_a_day_of_streaming_end_the_trial(box: TrialBox):
     assert not (box.opt / "palpate.trial").exists()
 
 
+def test_the_progress_of_a_start_that_failed_is_lost(box: TrialBox):
+    """A release that dies after each sixth sweep is not proven by them."""
+    for sweeps in (4, 6):
+        trial = box.start()
+        assert trial
+        assert f"on trial: {0 if sweeps == 4 else 4} of 50" in trial.text
+        for _ in range(sweeps):
+            trial.answered(verdict())
+        trial.turn(health(0))
+        if sweeps == 4:
+            trial.stopping()
+    trial = box.start()
+    assert trial
+    assert "on trial: 4 of 50" in trial.text
+
+
 def test_a_second_release_on_trial_goes_back_to_the_proven_one(box: TrialBox):
     """The release on trial is not proven. The proven release itself needs no trial."""
     box.start()

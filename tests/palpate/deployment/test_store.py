@@ -48,11 +48,14 @@ def test_a_fresh_box_runs_the_packaged_bundle(box):
 
 
 def test_the_progress_of_a_trial_is_noted(box):
-    """Starts, sweeps and seconds; a start that ended in order counts for no boot."""
+    """Starts, sweeps and seconds. A start that ended in order counts for no boot, and its progress
+    holds."""
     for counted in (True, False):
         box.store.note("a", TrialProgress(2, 3, 12.3, True), counted=counted)
         kept = box.store.state.of("a")
-        assert (kept.starts, kept.sweeps, kept.streamed_s, kept.worked) == (2, 3, 12.3, True)
+        held = (0, 0, 3, 12.3) if counted else (3, 12.3, 0, 0)
+        assert (kept.sweeps, kept.streamed_s, kept.last_sweeps, kept.last_s) == held
+        assert (kept.starts, kept.worked) == (2, True)
         assert bool(kept.boot) is counted
 
 

@@ -219,6 +219,18 @@ def test_enough_time_commits(box):
     assert box.standing.committed
 
 
+def test_what_a_crashed_start_has_shown_is_lost(box):
+    """A bundle that crashes after each third sweep is not committed by six of them."""
+    for _ in range(2):
+        dies = box.tried()
+        assert dies.text.startswith("on trial: 0 of 5")
+        for _ in range(3):
+            dies.answered(verdict())
+            dies.turn(health(0))
+    box.tried()
+    assert box.start() == box.one
+
+
 def test_what_an_orderly_run_has_shown_counts_in_the_next(box):
     """The progress of a crashed start is lost."""
     for n in range(2):
