@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate_train.data import raw_files
 from palpate_train.data.extras import library
-from palpate_train.data.files import json_lines, parquet
-from palpate_train.data.files.table import ReadPlan, Table, from_columns
+from palpate_train.data.files import parquet
+from palpate_train.data.files.table import Table, excerpt, from_columns
 from palpate_train.data.import_plan import ImportPlan, grid_shape
 
 INFO = Path("meta", "info.json")
@@ -91,6 +92,8 @@ def episodes(folder: Path, plan: ImportPlan) -> Iterator[tuple[str, Table]]:
         if missing := [c for c in (name, EPISODE, FRAME) if c not in known]:
             raise FormatError(f"{path}: has no column {missing[0]}; it has {', '.join(known)}")
         numbers = {c: np.asarray(content.column(c).to_numpy()) for c in (EPISODE, FRAME)}
+        if odd := [c for c, found in numbers.items() if found.dtype.kind not in "iu"]:
+            raise FormatError(f"{path}: {odd[0]} is not a whole number in each row; write it there")
         for episode in np.unique(numbers[EPISODE]):
             inside = numbers[EPISODE] == episode
             if (np.diff(numbers[FRAME][inside]) != 1).any():
@@ -115,7 +118,7 @@ def _feature(folder: Path, variable: str) -> tuple[str, tuple[int, ...]]:
     features = {
         name: about
         for name, about in _info(folder)["features"].items()
-        if about.get("dtype") not in PICTURES
+        if isinstance(about, dict) and about.get("dtype") not in PICTURES
     }
     if variable and variable in features:
         found = [variable]
@@ -127,22 +130,29 @@ def _feature(folder: Path, variable: str) -> tuple[str, tuple[int, ...]]:
             f"{folder}: holds {len(found)} tactile features; name one with --variable: "
             f"its features of numbers are {listed or 'none'}"
         )
-    return found[0], tuple(int(n) for n in features[found[0]].get("shape") or ())
+    shape = features[found[0]].get("shape") or []
+    if not isinstance(shape, list) or not all(type(n) is int and n > 0 for n in shape):
+        raise FormatError(
+            f"{folder / INFO}: the shape of {found[0]} is {excerpt(str(shape))}; write a list of "
+            "whole numbers above 0 there"
+        )
+    return found[0], tuple(shape)
 
 
 def _tasks(folder: Path) -> dict[int, str]:
     """The text of each task by its number; version 3 keeps the texts as the index of a table."""
-    lines, table = (folder / path for path in TASKS)
-    if lines.is_file():
-        read = json_lines.read(lines.read_bytes(), ReadPlan())
-        number, text = read.columns.index(TASK_INDEX), read.columns.index(TASK)
-        return dict(zip(read.values[:, number].astype(int).tolist(), read.texts[text], strict=True))
-    if not table.is_file():
+    path = next((folder / path for path in TASKS if (folder / path).is_file()), None)
+    if path is None:
         return {}
-    content = parquet.arrow(table)
-    (text_column,) = [name for name in content.column_names if name != TASK_INDEX]
-    numbers = content.column(TASK_INDEX).to_pylist()
-    return dict(zip(numbers, map(str, content.column(text_column).to_pylist()), strict=True))
+    read = raw_files.read(path)
+    texts = {read.columns[k]: text for k, text in read.texts.items()}
+    if TASK_INDEX not in read.columns or len(texts) != 1:
+        raise FormatError(
+            f"{path}: has the columns {', '.join(read.columns)}; "
+            f"write {TASK_INDEX} and a text there"
+        )
+    numbers = read.values[:, read.columns.index(TASK_INDEX)].tolist()
+    return dict(zip(numbers, *texts.values(), strict=True))
 
 
 def _table(
@@ -169,8 +179,8 @@ def _table(
         columns.append(np.zeros(len(flat), np.uint8))
     made = from_columns(names, columns, texts)
     timed = TIME in rows.column_names and each == 1
-    time = np.asarray(rows.column(TIME).to_numpy(), np.float64) if timed else None
-    vectors = {} if time is None else {TIME: time}
+    time = parquet.numbers(rows.column(TIME), TIME) if timed else None
+    vectors = {} if time is None else {TIME: time.astype(np.float64)}
     return Table(made.values, made.columns, vectors, tuple(vectors), texts)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from palpate.core.errors import FormatError
 from palpate_train.data.files import octave
 from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal
 from palpate_train.data.readers import array_in
@@ -92,6 +93,7 @@ def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:
             return
         kind = one.attrs.get(CLASS)
         kind = kind.decode("ascii", "replace") if isinstance(kind, bytes) else kind
+        kind = kind if isinstance(kind, str) else None
         if kind is None and not (matlab and one.dtype.kind in "biuf"):
             found[name] = Entry.of(one.shape, one.dtype, partial(array_in, file, name))
         elif kind in (None, *NUMERIC) and "MATLAB_empty" not in one.attrs:
@@ -115,7 +117,7 @@ def _octave(file: h5py.File) -> Mapping[str, Entry]:
             return  # a structure or a cell, whose parts are such groups
         at, short = f"{name}/value", "/".join(name.split("/")[::2])
         if OCTAVE_RANGE in value.attrs:
-            count = int(value.attrs[OCTAVE_RANGE])
+            count = _count(at, value)
             read = partial(_range, file, at, count)
             found[short] = Entry.of((count,), np.dtype(np.float64), read)
         elif OCTAVE_REAL.match(kind[()]) and "OCTAVE_EMPTY_MATRIX" not in one.attrs:
@@ -124,6 +126,18 @@ def _octave(file: h5py.File) -> Mapping[str, Entry]:
 
     file.visititems(keep)
     return found
+
+
+def _count(name: str, value: h5py.Dataset) -> int:
+    """How many numbers a range of Octave has. Raises FormatError."""
+    stated = value.attrs[OCTAVE_RANGE]
+    known = {"base", "increment"} <= set(value.dtype.names or ())
+    if not known or not isinstance(stated, np.integer):
+        raise FormatError(
+            f"{name} is a range of {value.dtype} with {OCTAVE_RANGE} {stated!r}; save it again "
+            "with Octave"
+        )
+    return int(stated)
 
 
 def _reversed(file: h5py.File, name: str) -> Array:

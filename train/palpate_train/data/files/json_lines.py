@@ -10,25 +10,32 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, from_columns, normal
+from palpate_train.data.files.table import (
+    Array,
+    ReadPlan,
+    Table,
+    excerpt,
+    from_columns,
+    normal,
+    timed,
+)
 from palpate_train.data.files.text import decoded, lines_of
 
-TIME = "time"
-"""The vector of the times that a file states by their interval, in s."""
 SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 
 
 def read(data: bytes, wanted: ReadPlan) -> Table:
     """The frames in a text of JSON. Raises FormatError that names the line and the key."""
     text, notes = decoded(data)
-    whole, facts, step_s = _whole(text), dict[str, str](), None
+    whole, facts = _whole(text), dict[str, str]()
+    acquired: dict[str, Any] | None = None
     if isinstance(whole, dict):
         facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
         if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
-            whole, step_s, said = _acquired(inner)
+            acquired, whole = inner, _acquired(inner)
         else:
             whole, said = _unwrapped(whole, wanted)
-        notes += said
+            notes += said
     if isinstance(whole, list) and whole and isinstance(whole[0], list | dict):
         rows, what = list(enumerate(whole, 1)), "entry"
     else:
@@ -41,9 +48,9 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
         notes = [*notes, f"{what} {frames[0][0]} is passed over: it has other keys"]
         frames = frames[1:]
     made = replace(table_of(frames, what, notes), facts=facts)
-    if step_s is None:
+    if acquired is None:
         return made
-    return replace(made, vectors={TIME: step_s * np.arange(len(made.values))}, beside=(TIME,))
+    return timed(made, "payload.interval_ms", acquired.get("interval_ms"), 1e-3)
 
 
 def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:
@@ -53,7 +60,7 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     frames beside facts about them. Raises FormatError.
     """
     if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
-        return [dict(zip(whole["columns"], row, strict=True)) for row in whole["data"]], []
+        return _rows(list(map(str, whole["columns"])), "columns", whole["data"], "data"), []
     if all(isinstance(v, dict) and _is_numbered(v) for v in whole.values()):
         whole = {key: list(values.values()) for key, values in whole.items()}
     lists = {k: v for k, v in whole.items() if isinstance(v, list) and len(v) > 1}
@@ -70,20 +77,32 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     return [dict(zip(whole, row, strict=True)) for row in zip(*whole.values(), strict=True)], []
 
 
-def _acquired(payload: dict[str, Any]) -> tuple[Any, float, list[str]]:
-    """The frames of Edge Impulse's data acquisition format, by the names of its sensors, and the
-    time between two in s."""
-    names = [str(sensor["name"]) for sensor in payload["sensors"]]
-    rows = [row if isinstance(row, list) else [row] for row in payload["values"]]
-    wrong = next((k for k, row in enumerate(rows, 1) if len(row) != len(names)), 0)
-    if wrong:
+def _acquired(payload: dict[str, Any]) -> list[dict[str, Any]]:
+    """The frames of Edge Impulse's data acquisition format, by the names of its sensors."""
+    sensors, values = payload.get("sensors"), payload["values"]
+    named = isinstance(sensors, list) and all(isinstance(s, dict) and "name" in s for s in sensors)
+    if not named:
         raise FormatError(
-            f"entry {wrong} of its values has {len(rows[wrong - 1])} numbers, but there are "
-            f"{len(names)} sensors"
+            f"payload.sensors is {excerpt(str(sensors))}; write an object with a name for each "
+            "sensor there"
         )
-    step_s = float(payload["interval_ms"]) / 1e3
-    frames = [dict(zip(names, row, strict=True)) for row in rows]
-    return frames, step_s, [f"it was sent at {1 / step_s:g} Hz"]
+    if isinstance(values, list):
+        values = [row if isinstance(row, list) else [row] for row in values]
+    return _rows([str(s["name"]) for s in sensors], "payload.sensors", values, "payload.values")
+
+
+def _rows(names: list[str], named_by: str, rows: Any, key: str) -> list[dict[str, Any]]:
+    """The rows of a table by the names of its columns. named_by, key: where the names and the rows
+    stand. Raises FormatError if they do not fit."""
+    if not isinstance(rows, list):
+        raise FormatError(f"{key} is {excerpt(str(rows))}; write a list with each frame there")
+    for k, row in enumerate(rows, 1):
+        if not isinstance(row, list) or len(row) != len(names):
+            raise FormatError(
+                f"entry {k} of {key} is {excerpt(str(row))}; write {len(names)} numbers, as "
+                f"{named_by} says"
+            )
+    return [dict(zip(names, row, strict=True)) for row in rows]
 
 
 def _is_numbered(column: dict[str, Any]) -> bool:

@@ -74,7 +74,13 @@ def _topics(path: Path) -> dict[str, list[Message]]:
         for _, channel, message in reader.make_reader(file).iter_messages():
             if channel.message_encoding == JSON:
                 known = topics.setdefault(normal(channel.topic), [])
-                known.append((message.log_time, json.loads(message.data)))
+                try:
+                    known.append((message.log_time, json.loads(message.data)))
+                except ValueError as e:
+                    raise FormatError(
+                        f"message {len(known) + 1} of {printable(channel.topic)} is not JSON, as "
+                        f"its encoding says: {e}; record it again"
+                    ) from e
     return topics
 
 

@@ -17,6 +17,8 @@ from palpate.core.errors import FormatError
 from palpate.core.text import printable
 
 Array = NDArray[Any]
+TIME = "time"
+"""The vector of the times that a file states by the interval between two frames, in s."""
 MOST_LISTED = 12
 """Largest number of arrays that an error message lists."""
 LEAST_SERIES = 20
@@ -103,6 +105,24 @@ class Entry:
 def normal(name: str) -> str:
     """A name in Unicode's composed form (NFC), so that equal names have equal characters."""
     return unicodedata.normalize("NFC", name)
+
+
+def timed(table: Table, key: str, stated: Any, unit_s: float = 1.0) -> Table:
+    """A table with the vector TIME of the times of its frames, in s, by the interval between two
+    that its file states as the value of `key`; a remark in its place if that is no interval."""
+    try:
+        step_s = unit_s * float(stated)
+    except (TypeError, ValueError):
+        step_s = 0.0
+    if not 0 < step_s < math.inf:
+        note = f"{key} is {stated!r}, which is no time between two frames; give --rate HZ"
+        return replace(table, notes=(*table.notes, note))
+    return replace(
+        table,
+        vectors={TIME: step_s * np.arange(len(table.values))},
+        beside=(TIME,),
+        notes=(*table.notes, f"{key} is {stated}: {1 / step_s:g} Hz"),
+    )
 
 
 def excerpt(text: str) -> str:

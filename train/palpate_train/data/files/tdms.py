@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal
+from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal, timed
 
 STEP = "wf_increment"
 
@@ -64,8 +64,5 @@ def _table(group: Any) -> Table:
             values = np.zeros(len(values), np.uint8)
         columns.append(values)
     made = from_columns([c.name for c in kept], columns, texts, notes)
-    steps = {float(c.properties[STEP]) for c in kept if c.properties.get(STEP)}
-    if len(steps) != 1:
-        return made
-    time = steps.pop() * np.arange(len(made.values))
-    return replace(made, vectors={"time": time}, beside=("time",))
+    steps = {str(step) for c in kept if (step := c.properties.get(STEP))}
+    return timed(made, STEP, steps.pop()) if len(steps) == 1 else made

@@ -14,12 +14,13 @@ from itertools import pairwise
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt
+from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, timed
 
 START = re.compile(r'"?ASCII_DATA[\s",]*@@')
 FRAME = re.compile(r'"?Frame\s+(\d+)', re.IGNORECASE)
 KEY = re.compile(r'"?([A-Z_]+)"?[\s,]+"?(.*?)[",\s]*$')
 END = "@@"
+STEP = "SECONDS_PER_FRAME"
 NO_SENSEL = "B"
 Row = tuple[int, str]
 
@@ -54,12 +55,9 @@ def read(lines: Sequence[str], wanted: ReadPlan, notes: Sequence[str]) -> Table:
             raise FormatError(f"frame {after} follows frame {before}; export all frames")
     frames, dropped = _without_empty(frames)
     said += [dropped] if dropped else []
-    try:
-        step = float(head.get("SECONDS_PER_FRAME", "").split()[0])
-    except (ValueError, IndexError):
-        step = 0.0
-    beside = {"time": step * (np.array(numbers) - numbers[0])} if step > 0 else {}
-    return Table(frames, vectors=beside, beside=tuple(beside), notes=tuple(said))
+    made = Table(frames, notes=tuple(said))
+    stated = head.get(STEP, "").split()
+    return timed(made, STEP, stated[0]) if stated else made
 
 
 def _blocks(rows: Sequence[Row]) -> tuple[list[tuple[int, list[Row]]], list[str]]:
