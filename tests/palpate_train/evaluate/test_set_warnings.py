@@ -30,6 +30,7 @@ def test_what_no_fold_can_judge_is_counted():
     assert of_protocol(half, "random:4") == []
     (line,) = [line for line in set_warnings.of_set(half) if "session" in line]
     assert "(low, middle, high)" in line
+    assert set_warnings.of_set(half, learned=False) == []
     assert not any("session only" in line for line in set_warnings.of_set(sweeps))
     rng = np.random.default_rng(1)
     long = rng.normal(0, 20, (8, 640, 2, 2)).astype(np.int16)

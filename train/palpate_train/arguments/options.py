@@ -141,9 +141,9 @@ def writable_file(path: Path, option: str = "--out", *endings: str) -> None:
     writable(path, option)
 
 
-def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
+def load(args: argparse.Namespace, seed: int = 1, learned: bool = True) -> sets.Dataset:
     """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated
-    sets without one.
+    sets without one. learned: whether a model learns from it.
 
     Warns of materials without sweeps, which are left out, of taxels that never change, and of the
     traps of set_warnings.of_set.
@@ -153,7 +153,7 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     labels.check_renames(pairs, (name for sweeps in loaded for name in sweeps.materials))
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
-    for line in [*warnings_of(part if args.only else whole), *set_warnings.of_set(part)]:
+    for line in [*warnings_of(part if args.only else whole), *set_warnings.of_set(part, learned)]:
         say(f"palpate-train: {line}", file=sys.stderr)
     return part
 

@@ -123,7 +123,7 @@ def run_score(args: argparse.Namespace) -> None:
     """Run the set through the box's classifier; print the figures, and write them."""
     if args.json:
         options.writable_file(args.json, "--json", ".json")
-    loaded, sweeps = bundle.load(args.bundle), options.load(args)
+    loaded, sweeps = bundle.load(args.bundle), options.load(args, learned=False)
     less = rules.without(loaded, args.left_out)
     found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
     seen = _seen(loaded.manifest, sweeps)

@@ -56,7 +56,7 @@ def run_report(args: argparse.Namespace) -> None:
             options.writable_file(path, f"--{option}", *endings)
     with extras.needed_for("a report"):
         from palpate_train.reports import bundle_experiment, bundle_report, bundle_trainings
-    sweeps, log = options.load(args), options.Log()
+    sweeps, log = options.load(args, learned=False), options.Log()
     train = sets.join([sets.load(spec, 1) for spec in args.train]) if args.train else None
     with tempfile.TemporaryDirectory() as folder:
         bundle, own = args.bundle, None

@@ -16,14 +16,13 @@ from palpate_train.evaluate import level_check
 Array = NDArray[Any]
 
 
-def of_set(sweeps: Dataset) -> list[str]:
-    """The warnings about a set that can be trained on: sweeps that it holds twice, materials that
-    were recorded under one condition only, and the mean level."""
-    return [
-        *repeats.warnings_of(sweeps, repeats.pairs(sweeps)),
-        *_coinciding(sweeps),
-        *level_check.warnings_of(sweeps),
-    ]
+def of_set(sweeps: Dataset, learned: bool = True) -> list[str]:
+    """The warnings about a set: sweeps that it holds twice; and if a model can learn from it,
+    materials that were recorded under one condition only, and the mean level."""
+    twice = repeats.warnings_of(sweeps, repeats.pairs(sweeps))
+    if not learned:
+        return list(twice)
+    return [*twice, *_coinciding(sweeps), *level_check.warnings_of(sweeps)]
 
 
 def _coinciding(sweeps: Dataset) -> Iterator[str]:

@@ -42,15 +42,17 @@ def left_out(
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
 ) -> Json:
-    """Train without each material in turn; `unknown` of the sweeps of `test`.
+    """`unknown` of the sweeps of `test` if each material in turn is left out of heads, embedding
+    and limits. One training suffices: its features are chosen with all materials.
 
     Raises FormatError if the sets do not fit together, or if the method has no features to judge
     novelty by.
     """
     plan = Trainings.of(train, test, "", SEED)
-    wanted = [t for t in plan.tasks(method, effort, SEED) if t.left_out != NONE_LEFT_OUT]
-    done = cases(wanted, plan.sweeps, where, log)
-    return unknown([(case, case.calibration()) for case in done], plan.sweeps.materials)
+    wanted = [t for t in plan.tasks(method, effort, SEED) if t.left_out == NONE_LEFT_OUT]
+    (whole,) = cases(wanted, plan.sweeps, where, log)
+    without = map(whole.without, range(len(plan.sweeps.materials)))
+    return unknown([(case, case.calibration()) for case in without], plan.sweeps.materials)
 
 
 def error(confidence: Array, right: Array) -> float:

@@ -109,12 +109,35 @@ class Case:
         )
         return fit_calibration(given)
 
+    def without(self, material: int) -> Case:
+        """The same trunk with heads, embedding and limits that have not seen a material, from a
+        training on all. `learn` without the material would choose other features, too."""
+        seen, copied = self.seen_labels != material, self.copied_labels != material
+        return replace(
+            self,
+            left_out=material,
+            seen=self.seen[seen],
+            seen_labels=_closed(self.seen_labels[seen], material),
+            seen_groups=self.seen_groups[:, seen],
+            held=self.held[seen],
+            faulty=self.faulty[seen],
+            copied=self.copied[copied],
+            copied_labels=_closed(self.copied_labels[copied], material),
+            copied_source=(np.cumsum(seen) - 1)[self.copied_source[copied]],
+            copied_held=self.copied_held[copied],
+        )
+
     def numbered(self) -> Array:
         """The test sweeps' labels [n], numbered like `seen_labels`. Those of the material left out
         have no meaning."""
         if self.left_out == NONE_LEFT_OUT:
             return self.labels
-        return self.labels - (self.labels > self.left_out)
+        return _closed(self.labels, self.left_out)
+
+
+def _closed(labels: Array, material: int) -> Array:
+    """Labels without the number of a material."""
+    return labels - (labels > material)
 
 
 def learn(task: CaseTask, sweeps: Dataset) -> Case:
@@ -132,7 +155,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     part = sweeps.take(kept)
     if task.left_out != NONE_LEFT_OUT:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
-        part = replace(part, labels=part.labels - (part.labels > task.left_out), materials=others)
+        part = replace(part, labels=_closed(part.labels, task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
     given = calibration_inputs(made)
     copies = given.copied

@@ -80,15 +80,15 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
 def _acquired(payload: dict[str, Any]) -> list[dict[str, Any]]:
     """The frames of Edge Impulse's data acquisition format, by the names of its sensors."""
     sensors, values = payload.get("sensors"), payload["values"]
-    named = isinstance(sensors, list) and all(isinstance(s, dict) and "name" in s for s in sensors)
-    if not named:
+    each = sensors if isinstance(sensors, list) else [sensors]
+    if not all(isinstance(one, dict) and "name" in one for one in each):
         raise FormatError(
             f"payload.sensors is {excerpt(str(sensors))}; write an object with a name for each "
             "sensor there"
         )
     if isinstance(values, list):
         values = [row if isinstance(row, list) else [row] for row in values]
-    return _rows([str(s["name"]) for s in sensors], "payload.sensors", values, "payload.values")
+    return _rows([str(one["name"]) for one in each], "payload.sensors", values, "payload.values")
 
 
 def _rows(names: list[str], named_by: str, rows: Any, key: str) -> list[dict[str, Any]]:
