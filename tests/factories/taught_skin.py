@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.clock import SystemClock
-from tests.factories import install_scripts
 from tests.factories.paths import ROOT
 from tests.factories.skins.player import Player, running
 from tests.factories.skins.wires import wire
@@ -55,7 +54,7 @@ class TaughtBox:
         sets = {
             "store.folder": self.folder / "store",
             "store.keys": self.folder,
-            "store.runtime": '""',
+            "store.runtime": self.folder / "run",
         }
         return [word for k, v in sets.items() for word in ("--set", f"{k}={v}")]
 
@@ -96,12 +95,12 @@ class TaughtBox:
 
 @contextmanager
 def taught_box() -> Iterator[TaughtBox]:
-    """A box without a bundle for its skin, which is plugged in."""
+    """A bench without a bundle for its skin, which is plugged in, and without a key."""
     skin = SlidSkin()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "store").mkdir()
-        install_scripts.enrolment_key(folder / "enrolment")
+        (folder / "run").mkdir()
         player = Player(wire("matrix", RATE_HZ), skin, SystemClock(), folder / "ttySkin")
         with running(player):
             box = TaughtBox(folder, player, skin)

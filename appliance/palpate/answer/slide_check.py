@@ -7,6 +7,7 @@ taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -24,6 +25,11 @@ MANY, CLEAR = 4, 2 * CHANCE
 """Fewest sweeps by which others are judged, and the least median height of their patterns. The
 median of simulated slides is 20, that of skins whose slides show no pattern 3 to 6."""
 NO_SLIDE = f"no slide: {NO_PATTERN}, as with a resting finger"
+QUIET = math.log(4)
+"""A sweep rests if its vibration over load is less than a quarter of the median of its material, in
+logarithms. Slides over one material differ by less in the simulator."""
+RESTS = "the finger rests: other sweeps of this material vibrate four times as much"
+UNCHECKED = "slides on this skin show no pattern, so a finger that always rests is not noticed"
 
 
 class SlideCheck:
@@ -71,10 +77,11 @@ class SlideCheck:
 
 class SlidesAmong:
     """Checks windows of one format where no bundle knows the skin: a window without a pattern is
-    not a slide if those before it showed one."""
+    not a slide if those before it showed one. unchecked: what `among` could not see, "" if all."""
 
     def __init__(self, format: SweepFormat) -> None:
         self._meter, self._heights = SlideMeter(format, 1.0), list[float]()
+        self.unchecked = ""
 
     def __call__(self, taxels: NDArray[Any]) -> str | None:
         """As SlideCheck."""
@@ -86,12 +93,27 @@ class SlidesAmong:
         self._heights.append(height)
         return None
 
-    def among(self, windows: Iterable[NDArray[Any]]) -> list[str | None]:
-        """The reason for each of these windows. They are judged by one another."""
+    def among(self, windows: Iterable[NDArray[Any]], materials: Sequence[str]) -> list[str | None]:
+        """The reason for each of these windows, of `materials`. They are judged by one another; if
+        they show no pattern, by the vibration of those of their material."""
+        vibrations = []
         for taxels in windows:
             self._heights.append(0.0 if self._meter.why is not None else self._meter(taxels).height)
-        skin = _patterned(self._heights)
-        return [NO_SLIDE if skin and one < CHANCE else None for one in self._heights]
+            parts = vibration(taxels, np.zeros(taxels.shape[1:])) if len(taxels) > PARTS else [0.0]
+            vibrations.append(float(np.median(parts)))
+        if _patterned(self._heights):
+            return [NO_SLIDE if one < CHANCE else None for one in self._heights]
+        self.unchecked = UNCHECKED if len(vibrations) >= MANY else ""
+        of = {
+            own: [v for v, name in zip(vibrations, materials, strict=True) if name == own]
+            for own in materials
+        }
+        pairs = zip(vibrations, materials, strict=True)
+        return [RESTS if _rests(one, of[own]) else None for one, own in pairs]
+
+
+def _rests(vibration: float, of_material: Sequence[float]) -> bool:
+    return len(of_material) >= MANY and vibration < float(np.median(of_material)) - QUIET
 
 
 def _patterned(heights: Sequence[float]) -> bool:

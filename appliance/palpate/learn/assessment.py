@@ -53,6 +53,7 @@ class Assessment:
     [N, K], mean probabilities. left_out: the groups that were left out. clusters: int [N], sweeps
     that succeed or fail together; None if each is on its own. others: for things that were not
     taught, in words, the share that would get a label and their number; empty if not measured.
+    unchecked: what nothing could check, in words.
     """
 
     materials: tuple[str, ...]
@@ -64,6 +65,7 @@ class Assessment:
     clusters: Array | None = None
     no_slides: tuple[NoSlide, ...] = ()
     others: Mapping[str, tuple[float, int]] = field(default_factory=dict)
+    unchecked: str = ""
 
     @property
     def right(self) -> Array:
@@ -166,7 +168,7 @@ class Assessment:
             said += f"; most often confused: {one} and {other}"
         for what, (share, n) in self.others.items():
             said += f"; of {n} {what} {100 * share:.0f} % would get a label"
-        return said
+        return f"{said}; {self.unchecked}" if self.unchecked else said
 
     def _counts(self) -> Array:
         """float [K, K], rows by the material of the sweeps, columns by the answers."""

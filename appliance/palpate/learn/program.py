@@ -233,10 +233,12 @@ class TryingPhase(Phase):
         facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
         again = {"TEACH": self._teach_again}
         self.orders = {**again, "DONE": program.finish}
-        reports = *trial, *status(settings, facts), *program.pages
+        known = {"bundle": choice.bundle.id, "labels": m.labels, "displays": m.displays}
+        source = program.devices.source
+        shown = *status(settings, facts), *feed(settings, m.format, source, known, facts)
         self.box = assembly.box(
             *(settings, choice.bundle, program.devices, program.port(), stack),
-            observers=[disk, Notifier(SystemClock()), *reports],
+            observers=[disk, Notifier(SystemClock()), *trial, *shown, *program.pages],
             commands=program.by_robot(again),
             ordered=bool(program.pages),
         )

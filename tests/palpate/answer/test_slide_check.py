@@ -115,6 +115,35 @@ def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind):
     assert [check(one) for one in slides(MANY)] == [None] * MANY
     assert check(rest).startswith("no slide")
     assert check(slides(1)[0]) is None
-    first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)])
+    first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)], ["wood"] * (MANY + 1))
     assert first[0].startswith("no slide")
     assert first[1:] == [None] * MANY
+
+
+def test_a_rest_among_slides_without_a_pattern_is_known_by_its_vibration():
+    """On a skin of two taxels, among sweeps of its material; another material may vibrate less, and
+    three sweeps are too few to say. What the check cannot see is said."""
+    rng = np.random.default_rng(3)
+    format = SweepFormat(1, 2, 100, 200, "uint8")
+
+    def sweep(deviation: float) -> np.ndarray:
+        return np.rint(rng.normal(100, deviation, (200, 1, 2))).astype(np.uint8)
+
+    windows = [*(sweep(12) for _ in range(MANY)), sweep(1), *(sweep(1) for _ in range(MANY))]
+    names = ["rough"] * (MANY + 1) + ["smooth"] * MANY
+    check = SlidesAmong(format)
+    found = check.among(windows, names)
+    assert "no pattern" in check.unchecked
+    assert [i for i, why in enumerate(found) if why] == [MANY]
+    assert "rests" in str(found[MANY])
+    assert SlidesAmong(format).among(windows[MANY - 2 : MANY + 1], ["rough"] * 3) == [None] * 3
+
+
+def test_slides_over_one_material_vibrate_alike():
+    """None of several placements is taken for a rest on a skin whose pattern cannot be seen."""
+    rng, world = np.random.default_rng(6), skin.WORLDS["level-blind"]
+    places = skin.placements("T-REAL", 1005)
+    made = [(m, p) for m in skin.MATERIALS for p in places[:MANY] for _ in range(2)]
+    row = SweepFormat(1, 2, skin.FORMAT.rate_hz, skin.FORMAT.window, "uint8")
+    windows = [skin.window(m, p, rng, world)[:, 1:2, 1:3] for m, p in made]
+    assert not any(SlidesAmong(row).among(windows, [m for m, _ in made]))

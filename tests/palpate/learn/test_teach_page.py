@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from palpate.client.feed import Feed
+from palpate.core.config import FEED
 from tests.factories import deliveries
 from tests.factories.browser import BrowsedPage, until
 from tests.factories.taught_skin import PITCHES, SLIDE_S, TaughtBox, taught_box
@@ -90,6 +92,11 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser, box):
     hand.page.wait_for_selector("#done:visible")
     waited = time.monotonic() - begun
     assert "taught" in hand.seen.text("#learnt")
+    assert (box.folder / "enrolment" / "key").exists()  # the bench had none
+    with Feed(box.folder / "run" / FEED) as feed:
+        hello = feed.read(60)
+    assert hello
+    assert set(hello["labels"]) == set(PITCHES)
     slides = {}
     for material in PITCHES:
         for slide in range(1, TRIES + 1):

@@ -93,4 +93,5 @@ def judged(lesson: Lesson, parts: Sequence[InnerPart], p: Array) -> Assessment:
         groups,
         None if groups == ("recording",) else cluster,
         lesson.no_slides,
+        unchecked=lesson.unchecked,
     )

@@ -28,12 +28,14 @@ NOWHERE = "not named"
 @dataclass(frozen=True)
 class Lesson:
     """Sweeps to learn from. names: of the file of each sweep [N], without suffix. left_out: number
-    of sweeps that are not among them, by reason. no_slides: those of them that are not slides."""
+    of sweeps that are not among them, by reason. no_slides: those of them that are not slides.
+    unchecked: what could not be seen of that, "" if all."""
 
     sweeps: Dataset
     names: tuple[str, ...]
     left_out: Mapping[str, int]
     no_slides: tuple[NoSlide, ...] = ()
+    unchecked: str = ""
 
     @classmethod
     def read(cls, folder: Path) -> Lesson:
@@ -46,11 +48,15 @@ class Lesson:
             why = f" ({counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
         kept = _of_one_format(kept, left_out)
-        slides = SlidesAmong(kept[0].format).among(one.sweep.frames.taxels for one in kept)
+        check = SlidesAmong(kept[0].format)
+        slides = check.among(
+            (one.sweep.frames.taxels for one in kept), [one.sweep.material for one in kept]
+        )
         kept, no_slides = slides_alone(kept, slides)
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = from_recorded(_named(kept), folder, Dataset)
-        return cls(labels.check(sweeps), tuple(one.path.stem for one in kept), left_out, no_slides)
+        names = tuple(one.path.stem for one in kept)
+        return cls(labels.check(sweeps), names, left_out, no_slides, check.unchecked)
 
     @property
     def _beside(self) -> str:

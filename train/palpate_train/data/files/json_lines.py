@@ -80,7 +80,7 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
 def _acquired(payload: dict[str, Any]) -> list[dict[str, Any]]:
     """The frames of Edge Impulse's data acquisition format, by the names of its sensors."""
     sensors, values = payload.get("sensors"), payload["values"]
-    each = sensors if isinstance(sensors, list) else [sensors]
+    each: list[Any] = sensors if isinstance(sensors, list) else [sensors]
     if not all(isinstance(one, dict) and "name" in one for one in each):
         raise FormatError(
             f"payload.sensors is {excerpt(str(sensors))}; write an object with a name for each "
