@@ -86,6 +86,8 @@ OPTIONS: Mapping[str, _Row] = {
     "every": ("--every", "timed: seconds from one start to the next (5)", _time(_LEAST_S)),
     "sweep": ("--sweep", "timed: seconds from start to stop (3)", _time(_LEAST_S)),
     "capture": ("--capture", "write all input to FILE, for replay", _FILE),
+    "mcap": ("--mcap", "write the sweeps and their recorded verdicts to the new FILE, for Foxglove,"
+        " instead", _FILE),
     "shadow": ("--shadow", "also classify with the bundle in DIR, by default the candidate of the"
         " store; its answers are only compared", _text("DIR", None, nargs="?", const="")),
     "raw": ("--raw", "print the sentences alone", _FLAG),

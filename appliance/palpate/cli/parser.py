@@ -76,7 +76,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
         "watch": _Row("show the running box live: a line a verdict, or a page",
             "cli.look_commands.run_watch", "feed|watch-page"),
         "replay": _Row("classify a capture, a kept sweep or a folder of them again",
-            "cli.look_commands.run_replay", "file"),
+            "cli.look_commands.run_replay", "file mcap"),
     },
     "record and learn": {
         "record": _Row("keep each sweep with its label, for training; needs no bundle",

@@ -66,6 +66,8 @@ def test_recordings_with_their_verdicts(tmp_path: Path):
     assert box([*words.split(), str(tmp_path / "kept")]) == 0
     sweeps, frames = mcap_writer.write(str(tmp_path / "kept"), tmp_path / "a.mcap")
     assert sweeps == 2
+    assert box(["replay", str(tmp_path / "kept"), "--mcap", str(tmp_path / "b.mcap")]) == 0
+    assert (tmp_path / "b.mcap").read_bytes() == (tmp_path / "a.mcap").read_bytes()
     with (tmp_path / "a.mcap").open("rb") as file:
         found = list(mcap.reader.make_reader(file).iter_messages(topics=["/verdict", "/skin"]))
     verdicts = [json.loads(m.data) for _, c, m in found if c.topic == "/verdict"]
