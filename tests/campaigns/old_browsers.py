@@ -1,13 +1,19 @@
-"""All pages in the browsers of older tablets: Chromium 83, 88 and 92, and 72, which is too old.
+"""All pages in the browsers of older tablets: Chromium 83, 88 and 92, and 72, which is too old; and
+in WebKit, the engine of Safari, which Debian's webkit2gtk-driver brings.
 
-`python -m tests.campaigns old-browsers [VERSION ...]` takes them from the npm packages of
+`python -m tests.campaigns old-browsers [VERSION ...]` takes Chromium from the npm packages of
 chrome-aws-lambda, once, into build/browsers. Each opens every view, and orders a sweep on the pages
 that record and teach. The exit code is 1 unless all work and the oldest says why it does not.
 """
 
+from __future__ import annotations
+
 import asyncio
 import json
+import os
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -29,6 +35,9 @@ from tests.factories.shown_page import Shown
 PACKAGES = {"72": "1.11.2", "83": "3.1.1", "88": "5.5.0", "92": "10.1.0"}
 """Versions of the package by those of Chromium."""
 TOO_OLD = "72"
+WEBKIT = "WebKit"
+WEBKIT_PROGRAMS = "xvfb-run", "xauth", "WebKitWebDriver"
+FAILED = "failed"
 FOLDER = ROOT / "build" / "browsers"
 UNPACK = (
     "require('fs').writeFileSync(process.argv[2], require('zlib').brotliDecompressSync("
@@ -63,8 +72,8 @@ def program(version: str) -> Path:
 
 
 @contextmanager
-def started(version: str) -> Iterator[int]:
-    """The port at which a new browser is told what to do."""
+def started(version: str) -> Iterator[Tab]:
+    """A tab of a new Chromium."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         # the oldest has no process apart that could start others as root
         one = "--single-process" if version == TOO_OLD else "--no-zygote"
@@ -75,7 +84,7 @@ def started(version: str) -> Iterator[int]:
             while not (port.exists() and "\n" in port.read_text()):
                 assert time.monotonic() < end, f"Chromium {version} does not start"
                 time.sleep(0.1)
-            yield int(port.read_text().split()[0])
+            yield Tab(int(port.read_text().split()[0]))
         finally:
             browser.kill()
             browser.wait()
@@ -112,9 +121,51 @@ class Tab:
             await asyncio.sleep(0.2)
 
 
-async def opened(version: str, port: int) -> None:
+class WebKitTab(Tab):
+    """The tab of a new WebKit, told by the protocol of WebDriver at `port`."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(port)
+        (program,) = Path("/usr/lib").glob("*/webkit2gtk-4.1/MiniBrowser")
+        options = {"binary": str(program), "args": ["--automation"]}
+        wanted = {"capabilities": {"alwaysMatch": {"webkitgtk:browserOptions": options}}}
+        self._session = ""
+        self._session = f"/{self._answer('', wanted)['sessionId']}"
+
+    def _answer(self, path: str, content: object) -> Any:
+        address = f"http://127.0.0.1:{self._port}/session{self._session}{path}"
+        with urllib.request.urlopen(address, json.dumps(content).encode(), WAIT_S) as answer:
+            return json.load(answer)["value"]
+
+    async def do(self, method: str, **parameters: Any) -> Any:
+        """As the protocol of DevTools has the two commands that are needed."""
+        if method == "Page.navigate":
+            return self._answer("/url", parameters)
+        script = f"return ({parameters['expression']})"
+        return {"result": {"value": self._answer("/execute/sync", {"script": script, "args": []})}}
+
+
+@contextmanager
+def webkit() -> Iterator[WebKitTab]:
+    """A tab on a screen that nobody sees."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = ("xvfb-run", "-a", "WebKitWebDriver", f"--port={port}")
+    driver = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        end = time.monotonic() + WAIT_S
+        while socket.socket().connect_ex(("127.0.0.1", port)):
+            assert time.monotonic() < end, "WebKitWebDriver does not start"
+            time.sleep(0.1)
+        yield WebKitTab(port)
+    finally:
+        os.killpg(driver.pid, signal.SIGTERM)  # the screen is a process of its own
+        driver.wait(WAIT_S)
+
+
+async def opened(version: str, tab: Tab) -> None:
     """Open all pages. Raises AssertionError."""
-    tab = Tab(port)
     with Shown(Access(0)) as shown:
         shown.shift()
         for view, seen in SEEN.items():
@@ -136,25 +187,35 @@ async def opened(version: str, port: int) -> None:
             assert page.done == ["START"]
 
 
+def missing(version: str) -> str:
+    """Why a browser cannot be had here, "" if it can."""
+    if version == WEBKIT:
+        return " ".join(name for name in WEBKIT_PROGRAMS if not shutil.which(name))
+    try:
+        program(version)
+    except (OSError, subprocess.CalledProcessError, ValueError) as e:
+        return str(e)
+    return ""
+
+
+def tried(version: str) -> str:
+    """What came of opening the pages in one browser."""
+    if why := missing(version):
+        return f"skipped, since it cannot be had here ({why})"
+    try:
+        with webkit() if version == WEBKIT else started(version) as tab:
+            asyncio.run(opened(version, tab))
+    except (AssertionError, KeyError, ValueError) as e:
+        return f"{FAILED}: {e}"
+    return "says that it is too old" if version == TOO_OLD else "ok"
+
+
 def main() -> int:
     """Open the pages in each browser; the exit code."""
-    failed = 0
-    for version in sys.argv[1:] or PACKAGES:
-        try:
-            program(version)
-        except (OSError, subprocess.CalledProcessError, ValueError) as e:
-            print(f"Chromium {version}: skipped, since npm does not bring it here ({e})")
-            continue
-        try:
-            with started(version) as port:
-                asyncio.run(opened(version, port))
-            print(
-                f"Chromium {version}: {'says that it is too old' if version == TOO_OLD else 'ok'}"
-            )
-        except (AssertionError, KeyError, ValueError) as e:
-            print(f"Chromium {version}: {e}")
-            failed += 1
-    return 1 if failed else 0
+    said = {version: tried(version) for version in sys.argv[1:] or (*PACKAGES, WEBKIT)}
+    for version, text in said.items():
+        print(f"{version if version == WEBKIT else f'Chromium {version}'}: {text}")
+    return 1 if any(text.startswith(FAILED) for text in said.values()) else 0
 
 
 if __name__ == "__main__":
