@@ -1,7 +1,7 @@
 """Packs Palpate as Debian packages, for boxes that no desktop with make reaches.
 
-`python systemd/debian.py dist` writes a package for each architecture. It holds the archives that
-`make install` copies to a box, one for each Python of PYTHONS; its scripts run the commands that
+`python systemd/debian.py dist` writes a package for each architecture and Debian of PYTHONS. It
+holds the archive that `make install` copies to a box; its scripts run the commands that
 `make install` runs there. So a box is the same by either way, and either way can upgrade it. The
 environment is built on the box because dpkg removes the files of an old package before it sets up
 the new one: a release that fails its self-test must find the old release in place.
@@ -14,7 +14,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -27,8 +26,8 @@ from palpate import __version__
 from palpate.deployment.signature import own_key
 from release import ROOT, ReleaseArchives
 
-PYTHONS = ("3.11.2", "3.13.5")
-"""Python of Debian 12 and of Debian 13, and so of the Raspberry Pi OS of the same names."""
+PYTHONS = {"12": "3.11.2", "13": "3.13.5"}
+"""Python by the version of Debian, and so of the Raspberry Pi OS of the same name."""
 ARCHIVES = "/usr/lib/palpate"
 """Folder of the archives on a box."""
 UNITS = "palpate-teach.path palpate 'palpate@*' palpate-teach palpate-watch 'palpate-bridge@*'"
@@ -91,27 +90,27 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             archives = ReleaseArchives(args.wheels, [*PATHS, SKINS], Path(folder), args.key)
             for architecture in args.architectures:
-                print(packed(archives, architecture, args.out), flush=True)
+                for debian in PYTHONS:
+                    print(packed(archives, architecture, debian, args.out), flush=True)
     except (Failed, OSError) as e:
         sys.exit(f"palpate: {e}")
     return 0
 
 
-def packed(archives: ReleaseArchives, architecture: str, out: Path) -> Path:
-    """The package for an architecture of Debian, written to the folder `out`. Raises Failed."""
-    version = package_version()
-    target = out / f"palpate_{version}_{architecture}.deb"
+def packed(archives: ReleaseArchives, architecture: str, debian: str, out: Path) -> Path:
+    """The package for an architecture and a version of Debian, written to the folder `out`. Raises
+    Failed."""
+    version = f"{package_version()}.deb{debian}"
+    target, python = out / f"palpate_{version}_{architecture}.deb", PYTHONS[debian]
     with tempfile.TemporaryDirectory() as name:
-        folder, releases = Path(name), {}
+        folder = Path(name)
         (folder / "DEBIAN").mkdir()
         (folder / ARCHIVES[1:]).mkdir(parents=True)
-        for python in PYTHONS:
-            release, archive = archives.of(MACHINES[architecture], python)
-            releases[python.rpartition(".")[0]] = release
-            os.link(archive, folder / ARCHIVES[1:] / f"{release}.tar")
-        size = sum(path.stat().st_size for path in (folder / ARCHIVES[1:]).iterdir())
-        (folder / "DEBIAN/control").write_text(control(version, architecture, size))
-        for script, text in scripts(releases).items():
+        release, archive = archives.of(MACHINES[architecture], python)
+        os.link(archive, folder / ARCHIVES[1:] / f"{release}.tar")
+        text = control(version, architecture, python, archive.stat().st_size)
+        (folder / "DEBIAN/control").write_text(text)
+        for script, text in scripts(release, python).items():
             (folder / "DEBIAN" / script).write_text(text)
             (folder / "DEBIAN" / script).chmod(0o755)
         for path in folder.rglob("*"):
@@ -151,14 +150,21 @@ def package_version() -> str:
     return f"{__version__}+{done.stdout.strip()}" if done.stdout.strip() else __version__
 
 
-def control(version: str, architecture: str, size: int) -> str:
+def _short(python: str) -> tuple[str, str]:
+    """A version of Python without its last number, and the next: ("3.11", "3.12")."""
+    major, minor, _ = python.split(".")
+    return f"{major}.{minor}", f"{major}.{int(minor) + 1}"
+
+
+def control(version: str, architecture: str, python: str, size: int) -> str:
     """The description of the package. size: of its files, in bytes."""
+    least, beyond = _short(python)
     return f"""Package: palpate
 Version: {version}
 Architecture: {architecture}
 Maintainer: The Palpate developers <palpate@localhost>
 Installed-Size: {size // 1024}
-Depends: python3 (>= 3.11), {", ".join(PACKAGES)}, systemd
+Depends: python3 (>= {least}), python3 (<< {beyond}), {", ".join(PACKAGES)}, systemd
 Section: science
 Priority: optional
 Description: names the material that a robot's tactile skin touches
@@ -168,11 +174,11 @@ Description: names the material that a robot's tactile skin touches
 """
 
 
-def scripts(releases: Mapping[str, str]) -> dict[str, str]:
-    """The package's scripts by name. releases: the name of the release for each Python."""
+def scripts(release: str, python: str) -> dict[str, str]:
+    """The package's scripts by name. release: the name of the release. python: its Python."""
     own = " ".join(path for path in LINKS)
     return {
-        "postinst": _postinst(releases),
+        "postinst": _postinst(f"palpate-{release}", _short(python)[0]),
         "prerm": f"""#!/bin/sh
 [ "$1" != remove ] || [ ! -d /run/systemd/system ] || systemctl stop {UNITS} || true
 """,
@@ -193,24 +199,22 @@ fi
     }
 
 
-def _postinst(releases: Mapping[str, str]) -> str:
-    """The script that installs the release of the box's Python, as `make install` does."""
-    release = "/opt/$name"
-    cases = "\n".join(f"  {python}) name=palpate-{name} ;;" for python, name in releases.items())
+def _postinst(name: str, wanted: str) -> str:
+    """The script that installs the release of this name, as `make install` does. wanted: its
+    Python."""
+    release = f"/opt/{name}"
     return f"""#!/bin/sh
 set -e
 [ "$1" = configure ] || exit 0
 fail() {{ echo "palpate: $1" >&2; exit 1; }}
+name={name}
 python=$(python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])')
-case $python in
-{cases}
-  *) fail "python3 is $python; this package has libraries for {", ".join(releases)}" ;;
-esac
+[ "$python" = {wanted} ] || fail "python3 is $python; this package has libraries for {wanted}"
 [ "$(stat -c %m /opt)" = / ] || fail "/opt is a separate file system; make it part of /"
 [ ! -e {LINK} ] || [ -L {LINK} ] || fail "{LINK} is a folder, not a link; move it away"
 echo "palpate: building {release}"
 ( {install.build(release)}
-) < {ARCHIVES}/${{name#palpate-}}.tar
+) < {ARCHIVES}/{name.removeprefix("palpate-")}.tar
 ( {install.prepare(release, "")}
 )
 {install.self_test(release)}
