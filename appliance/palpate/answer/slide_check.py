@@ -112,8 +112,8 @@ class SlidesAmong:
         return [RESTS if _rests(one, of[own]) else None for one, own in pairs]
 
 
-def _rests(vibration: float, of_material: Sequence[float]) -> bool:
-    return len(of_material) >= MANY and vibration < float(np.median(of_material)) - QUIET
+def _rests(own: float, of_material: Sequence[float]) -> bool:
+    return len(of_material) >= MANY and own < float(np.median(of_material)) - QUIET
 
 
 def _patterned(heights: Sequence[float]) -> bool:

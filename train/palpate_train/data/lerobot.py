@@ -33,6 +33,8 @@ TACTILE = ("tactile", "touch", "taxel", "skin")
 SEVERAL = ("window", "history", "buffer", "stack", "sequence", "frames", "steps")
 """What the names of features and axes contain if a row holds several frames."""
 PICTURES = ("video", "image", "string")
+MOST = 1_000_000
+"""Beyond the number of taxels of any skin."""
 
 
 def is_data_set(folder: Path) -> bool:
@@ -131,12 +133,12 @@ def _feature(folder: Path, variable: str) -> tuple[str, tuple[int, ...]]:
             f"its features of numbers are {listed or 'none'}"
         )
     shape = features[found[0]].get("shape") or []
-    if not isinstance(shape, list) or not all(type(n) is int and n > 0 for n in shape):
+    if not isinstance(shape, list) or not all(n in range(1, MOST) for n in shape):
         raise FormatError(
             f"{folder / INFO}: the shape of {found[0]} is {excerpt(str(shape))}; write a list of "
             "whole numbers above 0 there"
         )
-    return found[0], tuple(shape)
+    return found[0], tuple(map(int, shape))
 
 
 def _tasks(folder: Path) -> dict[int, str]:
@@ -146,6 +148,7 @@ def _tasks(folder: Path) -> dict[int, str]:
         return {}
     read = raw_files.read(path)
     texts = {read.columns[k]: text for k, text in read.texts.items()}
+    texts = {TASK: texts[TASK]} if TASK in texts else texts
     if TASK_INDEX not in read.columns or len(texts) != 1:
         raise FormatError(
             f"{path}: has the columns {', '.join(read.columns)}; "
