@@ -93,9 +93,10 @@ def test_one_loaded_taxel_is_named_and_a_skin_without_patterns_not_judged():
     small = SweepFormat(1, 2, 100, 200, "uint8")
     assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) is None
     rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
-    assert SlidesAmong(skin.FORMAT).among(rests) == [None] * 6
+    assert SlidesAmong(skin.FORMAT).among(rests, ["wood"] * 6) == [None] * 6
     tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
-    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [None] * MANY
+    still = [np.zeros((200, 1, 2), np.uint8)] * MANY
+    assert tiny.among(still, ["wood"] * MANY) == [None] * MANY
     assert tiny(np.zeros((200, 1, 2), np.uint8)) is None
 
 
