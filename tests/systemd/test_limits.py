@@ -116,7 +116,7 @@ def test_a_box_that_has_to_be_taught_shows_its_page(machine: Machine, service: S
     service.start()
     for end, after in (
         ("sleep 3600", "stop palpate-teach"),
-        ("exit 78", "is-failed palpate-teach"),
+        ("exit 78", "is-active palpate-teach"),
     ):
         machine.put(dropin, f"[Service]\nExecStart=\nExecStart=/bin/sh -c '{end}'\n")
         machine.get("systemctl", "daemon-reload")
@@ -130,5 +130,6 @@ def test_a_box_that_has_to_be_taught_shows_its_page(machine: Machine, service: S
         service.until("ActiveState", "active")
         assert service["InvocationID"] != began
         assert machine.run("test", "-e", "/run/palpate/untaught").returncode == 1
+        assert "trigger source" not in machine.get("journalctl", "-q", "--no-pager", "-b")
     machine.get("rm", "-r", dropin)
     machine.get("systemctl", "daemon-reload")
