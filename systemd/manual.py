@@ -14,7 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from palpate.cli.parser import parser
 from palpate.core import config
@@ -148,7 +148,7 @@ def _meaning(name: str, key: Key, meanings: Mapping[str, str]) -> str:
     """The meaning of a key; a single GPIO line is named by its signal first."""
     last = name.partition(".")[2]
     text = meanings.get(last, "")
-    if "line" not in key.limits or get_origin(key.hint) is tuple:
+    if "line" not in key.metadata or get_origin(key.hint) is tuple:
         return text
     return f"{last.upper().replace('_', ' ')}: {text}".rstrip(": ")
 
@@ -159,15 +159,16 @@ def _default(key: Key) -> str:
 
 def allowed(key: Key) -> str:
     """The values that a setting may have."""
-    if "line" in key.limits:
+    if "line" in key.metadata:
         return "GPIO lines" if get_origin(key.hint) is tuple else "GPIO line"
-    if "allowed" in key.limits:
-        return str(key.limits["allowed"])
-    if get_args(key.hint):
-        return ", ".join(json.dumps(one) for one in get_args(key.hint))
+    if "allowed" in key.metadata:
+        return str(key.metadata["allowed"])
     if key.hint in (str, bool):
         return {str: "text", bool: "true, false"}[key.hint]
-    return f"{key.limits['least']:.8g} to {key.limits['most']:.8g}"
+    if get_origin(key.hint) is Literal:
+        return ", ".join(map(json.dumps, get_args(key.hint)))
+    bounds = key.hint.__metadata__[0]
+    return f"{bounds.least:.8g} to {bounds.most:.8g}"
 
 
 def command_sections(found: Sequence[Command], level: str = "##") -> str:

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +22,21 @@ from numpy.typing import NDArray
 from palpate.answer.pipeline import Context, Displacement, Refusal
 from palpate.answer.window import Window
 from palpate.core.errors import BundleError
+from palpate.core.schema import LEAST, Within, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
-MOST_POSITIONS, MOST_MM = 1000, 1e6
-"""Largest number of positions in a bundle, since each sweep is compared with all of them; largest
-length, 1 km."""
 LEAST_PART = 0.25
 """A direction with a smaller share of the distance is left out: it changes the distance by less
 than 3 %."""
+MOST_POSITIONS = 1000
+"""Largest number of positions in a bundle, since each sweep is compared with all of them."""
 IN_PLACE = "in place"
 
 Point = tuple[float, float]
+_Length = Annotated[float, Within(LEAST, 1e6)]
+_Places = Annotated[tuple[Annotated[float, Within(-1e6, 1e6)], ...], Within(1, MOST_POSITIONS)]
+"""In mm, up to 1 km."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,34 +48,17 @@ class ContactPositions:
     is farther than this from the nearest position counts as displaced.
     """
 
-    pitch_mm: float
-    rows_mm: tuple[float, ...]
-    cols_mm: tuple[float, ...]
-    limit_mm: float
+    pitch_mm: _Length
+    rows_mm: _Places
+    cols_mm: _Places
+    limit_mm: _Length
 
     def __post_init__(self) -> None:
-        for name in ("pitch_mm", "limit_mm"):
-            value = getattr(self, name)
-            if not _length(value) or value <= 0:
-                raise BundleError(
-                    f"place.{name} {value!r} must be mm above 0; export the bundle again"
-                )
-        for name in ("rows_mm", "cols_mm"):
-            values = getattr(self, name)
-            if (
-                type(values) is not tuple
-                or not 1 <= len(values) <= MOST_POSITIONS
-                or not all(map(_length, values))
-            ):
-                raise BundleError(
-                    f"place.{name} must be 1 to {MOST_POSITIONS} places in mm; export the bundle "
-                    "again"
-                )
+        check(self, "place")
         if len(self.rows_mm) != len(self.cols_mm):
             raise BundleError(
                 f"place has {len(self.rows_mm)} rows_mm and {len(self.cols_mm)} cols_mm, where "
-                "each position has one "
-                "of both; export the bundle again"
+                "each position has one of both; export the bundle again"
             )
 
     def offset(self, centre: Point) -> Point:
@@ -90,10 +76,6 @@ class ContactPositions:
 @lru_cache(maxsize=4)
 def _points(rows_mm: tuple[float, ...], cols_mm: tuple[float, ...]) -> NDArray[np.complex128]:
     return np.array(rows_mm) + 1j * np.array(cols_mm)
-
-
-def _length(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) <= MOST_MM
 
 
 def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> Point | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import TINY, Counts, Window, ones
 from palpate.core.errors import BundleError
+from palpate.core.schema import MOST, Positive, Within, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
 Array = NDArray[Any]
-NAMES = ("noise", "load", "speed", "lost", "hum")
+Name = Literal["noise", "load", "speed", "lost", "hum"]
 """The disturbances. noise, load: see below. speed: natural logarithm of the taxels that the slide
 passes in a second. lost: share of the frames that never arrived. hum: square root of the amplitude
 that was removed, in counts; large hum moves the embedding hardly further than small hum."""
-SAID = {
+SAID: Mapping[Name, tuple[str, str]] = {
     "noise": ("less noise", "more noise"),
     "load": ("a lower load", "a higher load"),
     "speed": ("a slower slide", "a faster slide"),
@@ -82,38 +83,29 @@ def hum(counts: float) -> float:
 class Allowance:
     """The allowance of a bundle for one disturbance.
 
-    of: one of NAMES. start: its value at the edge of training. end: the furthest value that export
+    of: its name. start: its value at the edge of training. end: the furthest value that export
     has proven. slope: growth of the limit of known materials, as a share of it, for a size of 1.
     tried: the furthest value that export has tried without proof; None without such a value. Raises
     BundleError for a value out of range.
     """
 
-    of: str
+    of: Name
     start: float
     end: float
-    slope: float
+    slope: Annotated[float, Within(0, MOST)]
     tried: float | None = None
 
     def __post_init__(self) -> None:
-        if self.of not in NAMES:
+        check(self, f"disturbances ({self.of})")
+        if self.start == self.end:
             raise BundleError(
-                f"disturbances name {self.of!r}, which is none of {', '.join(NAMES)}; update the "
-                "program or export the bundle again"
+                f"disturbances have start and end {self.start} for {self.of}, which must differ; "
+                "export the bundle again"
             )
-        numbers = self.start, self.end, self.slope
-        finite = all(type(v) in (int, float) and math.isfinite(v) for v in numbers)
-        if not finite or self.start == self.end or self.slope < 0:
+        if self.tried is not None and self._way * (self.tried - self.end) < 0:
             raise BundleError(
-                f"disturbances have {list(numbers)} for {self.of}; start and end must be different "
-                "finite numbers and the slope at least 0: export the bundle again"
-            )
-        further = self.tried is None or (
-            type(self.tried) in (int, float) and 0 <= self._way * (self.tried - self.end) < math.inf
-        )
-        if not further:
-            raise BundleError(
-                f"disturbances have tried {self.tried!r} for {self.of}, which must be a finite "
-                f"number beyond the end {self.end}: export the bundle again"
+                f"disturbances have tried {self.tried} for {self.of}, which must be beyond the end "
+                f"{self.end}; export the bundle again"
             )
 
     @property
@@ -142,16 +134,10 @@ class Disturbances:
     BundleError for a number out of range."""
 
     allowances: tuple[Allowance, ...] = ()
-    hum: float | None = None
+    hum: Positive | None = None
 
     def __post_init__(self) -> None:
-        if self.hum is not None and not (
-            type(self.hum) in (int, float) and 0 < self.hum < math.inf
-        ):
-            raise BundleError(
-                f"disturbances.hum {self.hum!r} must be a finite number above 0; export the "
-                "bundle again"
-            )
+        check(self, "disturbances")
 
     def sizes(self, values: Mapping[str, float]) -> list[float]:
         """Sizes [D] of the disturbances of a sweep. values: by name; one that is missing is not

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.unknown import EarlyDistances, positive
+from palpate.answer.unknown import EarlyDistances
 from palpate.core.errors import BundleError
+from palpate.core.schema import Positive, Within, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
@@ -31,26 +32,20 @@ class Early:
     materials are not detected before the end of a sweep.
     """
 
-    least: tuple[float, ...]
+    least: Annotated[tuple[Positive, ...], Within(1, 1000)]
     agree: int
-    limits: tuple[float, ...] = ()
+    limits: tuple[Positive, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.least or not all(positive(p) for p in self.least):
+        check(self, "early")
+        if not 1 <= self.agree <= len(self.least):
             raise BundleError(
-                f"early.least {list(self.least)} must be numbers above 0, one for each step; "
+                f"early.agree {self.agree} must be 1 to {len(self.least)}, the number of steps; "
                 "export the bundle again"
             )
-        if type(self.agree) is not int or not 1 <= self.agree <= len(self.least):
+        if self.limits and len(self.limits) != len(self.least):
             raise BundleError(
-                f"early.agree {self.agree!r} must be a whole number from 1 on, at most the steps; "
-                "export the bundle again"
-            )
-        if self.limits and not (
-            len(self.limits) == len(self.least) and all(map(positive, self.limits))
-        ):
-            raise BundleError(
-                f"early.limits {list(self.limits)} must be numbers above 0, one for each step; "
+                f"early.limits {list(self.limits)} must be {len(self.least)}, one for each step; "
                 "export the bundle again"
             )
 

@@ -8,17 +8,18 @@ principal components (Tipping and Bishop, Journal of the Royal Statistical Socie
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import BundleError
+from palpate.core.schema import LEAST, MOST, Within, check
 
-MOST_MODES = 8
+_MOST = MOST**0.25  # products of four stay finite
+_Row = tuple[Annotated[float, Within(-_MOST, _MOST)], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,25 +30,15 @@ class LoadModes:
     rest: variance of the noise. Raises BundleError for a value out of range.
     """
 
-    mean: tuple[float, ...]
-    modes: tuple[tuple[float, ...], ...]
-    rest: float
+    mean: _Row
+    modes: Annotated[tuple[_Row, ...], Within(1, 8)]
+    rest: Annotated[float, Within(LEAST, _MOST)]
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.modes) <= MOST_MODES:
-            raise BundleError(
-                f"bridging.loads has {len(self.modes)} modes; 1 to {MOST_MODES} are possible"
-            )
+        check(self, "bridging.loads")
         if {len(mode) for mode in self.modes} != {len(self.mean)}:
             raise BundleError(
                 "bridging.loads: each mode must have as many values as the mean; "
-                "export the bundle again"
-            )
-        numbers = [self.rest, *self.mean, *(value for mode in self.modes for value in mode)]
-        most = sys.float_info.max**0.25  # products of four stay finite
-        if not (self.rest > 0 and all(abs(number) <= most for number in numbers)):
-            raise BundleError(
-                "bridging.loads must have finite numbers, and `rest` above 0; "
                 "export the bundle again"
             )
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from palpate.answer.pipeline import Context, Refusal, Slide
 from palpate.answer.window import TINY, Counts, Waves, Window
 from palpate.core.errors import BundleError
+from palpate.core.schema import LEAST, Within, check
 from palpate.core.sentences import DIRECTIONS
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, SweepFormat
@@ -60,8 +61,6 @@ APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
 MARGIN = 1.2
 """A speed within this factor of the trained range counts as trained."""
-MOST_MM_S = 1e6
-"""Highest speed that a bundle may state."""
 SILENT = 1e-6
 """A taxel with less than this share of the power of the strongest taxel is silent."""
 
@@ -70,19 +69,13 @@ SILENT = 1e-6
 class SpeedRange:
     """Range of the measured speeds in training. Raises BundleError for a number out of range."""
 
-    least_mm_s: float
-    most_mm_s: float
+    least_mm_s: Annotated[float, Within(LEAST, 1e6)]
+    most_mm_s: Annotated[float, Within(LEAST, 1e6)]
 
     def __post_init__(self) -> None:
-        ends = self.least_mm_s, self.most_mm_s
-        if (
-            not all(type(v) in (int, float) for v in ends)
-            or not 0 < ends[0] <= ends[1] <= MOST_MM_S
-        ):
-            raise BundleError(
-                f"speeds {list(ends)} must be two mm/s above 0, the lower first, up to "
-                f"{MOST_MM_S:g}; export the bundle again"
-            )
+        check(self, "speeds")
+        if self.least_mm_s > self.most_mm_s:
+            raise BundleError(f"speeds {self} must be the lower first; export the bundle again")
 
     def outside(self, slide: Slide) -> str:
         """A message with the speed of `slide` if it is outside of the range by more than MARGIN;

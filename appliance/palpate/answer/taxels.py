@@ -7,10 +7,9 @@ of the bundle (train/palpate_train/answer/fit_taxels).
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from palpate.answer.load_modes import LoadModes
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import TRIPLES, Counts, Window
 from palpate.answer.window_check import Finding, WindowLimits, ceiling, enclosed, inspect
-from palpate.core.errors import BundleError
+from palpate.core.schema import Positive, Within, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import EPOCH_BITS, Frames, Status, SweepFormat, digitized, normal
 
@@ -30,7 +29,6 @@ LIVELY = 0.5
 finger slides."""
 LEAST_FRAMES = 75
 """Fewer frames do not show whether a taxel is noisy: their noise depends too much on chance."""
-MOST_TAXELS = 1000
 STRETCH = 3 * TRIPLES
 """Frames of a stretch of the stream, if a window has as many: its noise is then measured as
 precisely as that of a window."""
@@ -54,26 +52,16 @@ class Bridging:
     without them its direct neighbours do.
     """
 
-    taxels: int
+    taxels: Annotated[int, Within(0, 1000)]
     row: bool
     column: bool
-    noise: float
-    quietest: float
+    noise: Positive
+    quietest: Positive
     still: bool
     loads: LoadModes | None = None
 
     def __post_init__(self) -> None:
-        if type(self.taxels) is not int or not 0 <= self.taxels <= MOST_TAXELS:
-            raise BundleError(
-                f"bridging.taxels {self.taxels!r} must be a whole number from 0 to {MOST_TAXELS}; "
-                "export the bundle again"
-            )
-        for name in ("noise", "quietest"):
-            value = getattr(self, name)
-            if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
-                raise BundleError(
-                    f"bridging.{name} {value!r} must be a number above 0; export the bundle again"
-                )
+        check(self, "bridging")
 
     def allows(self, broken: Mask) -> bool:
         """Whether the taxels of the mask `broken` [R, C] may be bridged together."""

@@ -7,12 +7,12 @@ gives the label. An enrolled material is one more mean; nothing is trained for i
 
 from __future__ import annotations
 
-import sys
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
+from palpate.core.schema import Positive, Within, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
@@ -49,23 +50,18 @@ class Known:
     which a sweep gets one of them; None without enrolled labels.
     """
 
-    strict: float
-    balanced: float
-    loose: float
-    temperature: float
-    enrolled: float | None = None
+    strict: Positive
+    balanced: Positive
+    loose: Positive
+    temperature: Positive
+    enrolled: Annotated[float, Within(UNSURE, math.nextafter(1, 0))] | None = None
 
     def __post_init__(self) -> None:
-        _checkpositive(self, "known")
+        check(self, "known")
         if not self.strict <= self.balanced <= self.loose:
             raise BundleError(
                 f"known has the limits {self.strict:.4g}, {self.balanced:.4g}, {self.loose:.4g}, "
                 "which must not fall; export the bundle again"
-            )
-        if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
-            raise BundleError(
-                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1; "
-                "export the bundle again"
             )
 
     def growth(self, strangers: str) -> float:
@@ -85,27 +81,13 @@ class DisplacementRule:
     gets no label, because no training copy is displaced as far; None if unknown.
     """
 
-    limit: float
-    temperature: float
-    unsure: float
-    farthest_mm: float | None = None
+    limit: Positive
+    temperature: Positive
+    unsure: Positive
+    farthest_mm: Positive | None = None
 
     def __post_init__(self) -> None:
-        _checkpositive(self, "displacement")
-
-
-def _checkpositive(rule: Known | DisplacementRule, where: str) -> None:
-    for name in rule.__slots__:
-        value = getattr(rule, name)
-        if not positive(value) and not (value is None and name in ("farthest_mm", "enrolled")):
-            raise BundleError(
-                f"{where}.{name} {value!r} must be a number above 0; export the bundle again"
-            )
-
-
-def positive(value: object) -> bool:
-    """Whether `value` is a finite number above 0."""
-    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
+        check(self, "displacement")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

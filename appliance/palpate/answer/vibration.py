@@ -7,7 +7,6 @@ measure does not change with the gain of the skin. Pure functions of raw counts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from palpate.answer.disturbance import Disturbances
 from palpate.answer.objects import EnrolledLabels
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import TINY, Counts, Window, ones
-from palpate.core.errors import BundleError
+from palpate.core.schema import Positive, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
@@ -35,18 +34,10 @@ class SlideLimits:
     BundleError for a number out of range."""
 
     least: tuple[float, ...]
-    pattern: float | None = None
+    pattern: Positive | None = None
 
     def __post_init__(self) -> None:
-        if self.pattern is not None and not 0 < self.pattern < math.inf:
-            raise BundleError(
-                f"sliding.pattern {self.pattern} must be a finite number above 0; export the "
-                "bundle again"
-            )
-        if not all(type(v) is float and math.isfinite(v) for v in self.least):
-            raise BundleError(
-                f"sliding.least {list(self.least)} must be finite numbers; export the bundle again"
-            )
+        check(self, "sliding")
 
     def resting(self, vibrations: Array, label: int) -> list[int]:
         """The parts, counted from 1, that vibrate too little for the label with this number; none

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.unloaded import QUIET, UnloadedSkin
 from palpate.answer.window import Counts, Window
+from palpate.core.schema import MOST, Positive, Within
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
@@ -41,10 +42,10 @@ class WindowLimits:
     accepted number of dead taxels.
     """
 
-    contact: float | None
-    full_scale: float
-    saturated: float = MANY_FULL
-    dead_taxels: int = 0
+    contact: Annotated[float, Within(0, MOST)] | None
+    full_scale: Positive
+    saturated: Annotated[float, Within(0, 1)] = MANY_FULL
+    dead_taxels: Annotated[int, Within(0, 255 * 255)] = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from palpate.answer.vibration import SlideLimits
 from palpate.answer.window_check import WindowLimits
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.names import LABEL, MOST_SHOWN, can_be_shown
-from palpate.core.schema import typed
+from palpate.core.schema import MOST, Within, check, typed
 from palpate.core.types import SweepFormat
 
 SCHEMA = 1
@@ -44,7 +43,10 @@ class Thresholds(WindowLimits):
     dead_taxels: largest number that the model tolerates. unsure: least probability for status ok.
     """
 
-    unsure: float = UNSURE
+    unsure: Annotated[float, Within(0, MOST)] = UNSURE  # above 1 no sweep is ok
+
+    def __post_init__(self) -> None:
+        check(self, "thresholds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,23 +154,7 @@ def _faults(m: Manifest) -> Iterator[str]:
         yield f"counter {m.counter!r} must be a whole number from 0 on: sign the bundle again"
     yield from _wrong_files(m.files)
     yield from _wrong_names(m.labels, m.displays)
-    yield from _wrong_thresholds(m.thresholds, m.format.rows * m.format.cols)
     yield from _wrong_parts(m)
-
-
-def _wrong_thresholds(limits: Thresholds, taxels: int) -> Iterator[str]:
-    """A limit out of range. taxels: of the skin."""
-    ranges = (
-        ("contact", 0, sys.float_info.max),
-        ("full_scale", sys.float_info.min, sys.float_info.max),
-        ("saturated", 0, 1),
-        ("dead_taxels", 0, taxels - 1),
-        ("unsure", 0, sys.float_info.max),  # above 1 no sweep is ok
-    )
-    for name, least, most in ranges:
-        value = getattr(limits, name)
-        if not (value is None and name == "contact") and not least <= value <= most:
-            yield f"has {value} for thresholds.{name}, which must be {least:.3g} to {most:.3g}"
 
 
 def _wrong_parts(m: Manifest) -> Iterator[str]:
@@ -182,6 +168,8 @@ def _wrong_parts(m: Manifest) -> Iterator[str]:
         yield f"has `early`, but input {m.input!r} needs the whole window"
     if m.displacement and not (m.known and m.contact):
         yield "has `displacement` without `known` and `contact`"
+    if m.thresholds.dead_taxels >= taxels:
+        yield f"tolerates {m.thresholds.dead_taxels} dead taxels of {taxels}, which leaves none"
     if m.bridging and m.bridging.taxels >= taxels:
         yield f"bridges {m.bridging.taxels} of {taxels} taxels, which leaves none"
     loads = m.bridging and m.bridging.loads

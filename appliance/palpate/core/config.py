@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 from palpate.core import settings_files
 from palpate.core.errors import ConfigError
 from palpate.core.runtime_folder import FEED, RUNTIME, STATUS
-from palpate.core.schema import Key, custom, fixed, gpio_line, keys, number, read_table
+from palpate.core.schema import Key, Within, custom, fixed, gpio_line, keys, read_table
 from palpate.core.settings_files import SITE
 from palpate.core.text import closest, shown
 
@@ -50,13 +50,13 @@ class SkinConfig:
 
     profile: str = "palpate"
     grid: str = ""
-    rate_hz: float = number(0.0, 0.0, 100_000.0)
+    rate_hz: Annotated[float, Within(0.0, 100_000.0)] = 0.0
     tare: bool = False
     fingertip: Literal["", "first-row", "last-row", "first-column", "last-column"] = ""
     usb: str = custom("1209:7ac7", 'USB ids such as "1209:7ac7" or "1209:7ac7:SERIAL"', _usb)
     link: Literal["vendor", "acm", "serial"] = "vendor"
     port: str = ""
-    silence_ms: int = number(500, 1, 60_000)
+    silence_ms: Annotated[int, Within(1, 60_000)] = 500
     baud: int = fixed(0)  # of the serial port; 0: the profile's
     read_bytes: int = fixed(4096)  # whole USB packets (512): a smaller read can overflow
     timeout_ms: int = fixed(100)  # a read waits this long, and with it edges and commands
@@ -93,7 +93,7 @@ class TriggerConfig:
     stop: str = gpio_line()
     new_object: str = gpio_line()
     active_low: bool = False
-    glitch_us: int = number(500, 1, 1_000_000)
+    glitch_us: Annotated[int, Within(1, 1_000_000)] = 500
     storm_edges: int = fixed(2000)  # more edges in one burst come from a broken wire
     every_s: float = fixed(5.0)  # timed: from one START to the next (--every)
     sweep_s: float = fixed(3.0)  # timed: from START to STOP (--sweep)
@@ -115,8 +115,10 @@ class OutputConfig:
     result_valid: str = gpio_line()
     fault: str = gpio_line()
     decided: str = gpio_line()
-    class_bits: tuple[str, ...] = field(default=(), metadata={"line": True})
-    settle_us: int = number(200, 1, 1_000_000)
+    class_bits: tuple[str, ...] = field(
+        default=(), metadata={"line": True, "allowed": 'names such as ["GPIO16"]'}
+    )
+    settle_us: Annotated[int, Within(1, 1_000_000)] = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +126,7 @@ class SweepConfig:
     """Limits of a sweep. max_duration_s: a sweep without a stop edge for this long is answered
     `long`."""
 
-    max_duration_s: float = number(12.0, 0.1, 3600.0)
+    max_duration_s: Annotated[float, Within(0.1, 3600.0)] = 12.0
     late_ms: int = fixed(500)  # longest wait for frames after the stop edge
     lead_ms: int = fixed(500)  # early answers: from the start edge to the window
     # (with 500 ms the window is the middle of the paper's three seconds)
@@ -136,7 +138,7 @@ class SerialConfig:
     8N1."""
 
     port: str = ""
-    baud: int = number(115200, 1200, 4_000_000)
+    baud: Annotated[int, Within(1200, 4_000_000)] = 115200
     queue: int = fixed(64)  # sentences that wait for a slow reader; then the oldest is dropped
     state_s: float = fixed(1.0)  # between two STA sentences
 
@@ -163,10 +165,10 @@ class ClassifierConfig:
     allow_unsigned: bool = False
     fuse: Literal["product", "vote", "none"] = "product"
     early: bool = False
-    min_probability: float = number(0.0, 0.0, 1.0)
-    max_sweeps: int = number(5, 0, 1000)
+    min_probability: Annotated[float, Within(0.0, 1.0)] = 0.0
+    max_sweeps: Annotated[int, Within(0, 1000)] = 5
     conflict: Literal["new", "refuse", "fuse"] = "new"
-    object_s: float = number(60.0, 0.0, 86_400.0)
+    object_s: Annotated[float, Within(0.0, 86_400.0)] = 60.0
     strangers: Literal["strict", "balanced", "loose"] = "balanced"
 
 
@@ -185,8 +187,8 @@ class StoreConfig:
     folder: str = "/var/lib/palpate"
     keys: str = "/etc/palpate"
     runtime: str = RUNTIME
-    black_box: int = number(0, 0, 100_000)
-    trial_sweeps: int = number(20, 1, 100_000)
+    black_box: Annotated[int, Within(0, 100_000)] = 0
+    trial_sweeps: Annotated[int, Within(1, 100_000)] = 20
     trial_s: float = fixed(600.0)  # streaming time after which the trial ends as well
 
     @property
@@ -393,7 +395,7 @@ def _unknown(name: str, known: list[str], where: str) -> ConfigError:
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
     """Raise ConfigError if one GPIO line has two meanings."""
     taken: dict[str, str] = {}
-    for name in (n for n, key in _KEYS.items() if "line" in key.limits):
+    for name in (n for n, key in _KEYS.items() if "line" in key.metadata):
         for line in filter(None, [values[name]] if isinstance(values[name], str) else values[name]):
             if line in taken:
                 first = f"{taken[line]} ({sources[taken[line]]})"

@@ -8,21 +8,37 @@ and `read_table`, JSON objects with `typed`.
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache, partial
 from types import UnionType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from palpate.core.errors import BundleError
 from palpate.core.text import shown
 
-_Number = TypeVar("_Number", int, float)
 _Kind = TypeVar("_Kind")
+_hints: Callable[[Any], dict[str, Any]] = cache(partial(get_type_hints, include_extras=True))
 
 
-def number(default: _Number, least: _Number, most: _Number) -> _Number:
-    """A number field with its limits."""
-    return field(default=default, metadata={"least": least, "most": most})
+@dataclass(frozen=True, slots=True)
+class Within:
+    """Bounds of a number, or of the length of a tuple, as in Annotated[float, Within(0, 1)]."""
+
+    least: float
+    most: float
+
+    def __str__(self) -> str:
+        if self.least == LEAST:
+            return f"above 0, up to {self.most:.3g}"
+        return f"from {self.least} to {self.most}"
+
+
+LEAST, MOST = math.ulp(0.0), sys.float_info.max
+Positive = Annotated[float, Within(LEAST, MOST)]
+"""A finite number above 0."""
 
 
 def fixed(value: _Kind) -> _Kind:
@@ -37,51 +53,36 @@ def gpio_line() -> str:
 
 def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
     """A field with its own reader. allowed: the allowed values, for messages. read: returns the
-    converted value, or None if the value is not allowed. A dict as default is copied for each
-    object."""
-    metadata = {"allowed": allowed, "read": read}
-    if isinstance(default, dict):
-        return field(default_factory=default.copy, metadata=metadata)
-    return field(default=default, metadata=metadata)
+    converted value, or None if the value is not allowed."""
+    return field(default=default, metadata={"allowed": allowed, "read": read})
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A field of a dataclass as a key of TOML. hint: its type. limits: its metadata."""
+    """A field of a dataclass as a key of TOML. hint: its type. metadata: of the field."""
 
     hint: Any
     default: Any
-    limits: Mapping[str, Any]
+    metadata: Mapping[str, Any]
 
     def fit(self, value: Any) -> Any:
         """`value` as the field's type, or None if it is not allowed."""
-        if "read" in self.limits:
-            return self.limits["read"](value)
+        if "read" in self.metadata:
+            return self.metadata["read"](value)
         value = _nested(self.hint, value)
         if not _fits(value, self.hint) or (type(value) is tuple and "" in value):
             return None
-        if "least" not in self.limits:
-            return value
-        within = self.limits["least"] <= value <= self.limits["most"]
-        return self.hint(value) if within else None
+        return float(value) if type(self.default) is float else value
 
     @property
     def allowed(self) -> str:
         """The values that `fit` accepts, for a person."""
-        if "allowed" in self.limits:
-            return str(self.limits["allowed"])
-        if get_origin(self.hint) is Literal:
-            return "one of " + ", ".join(json.dumps(v) for v in get_args(self.hint))
-        if self.hint not in (int, float):
-            plain = {bool: "true or false", str: "a string in quotes, without control characters"}
-            return plain.get(self.hint, 'names such as ["GPIO16"]')
-        kind = "a whole number" if self.hint is int else "a number"
-        return f"{kind} from {self.limits['least']} to {self.limits['most']}"
+        return str(self.metadata.get("allowed", _words(self.hint)))
 
 
 def keys(kind: Any) -> dict[str, Key]:
     """The fields of the dataclass `kind` as keys of a TOML table, by name; without fixed ones."""
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     return {
         f.name: Key(hints[f.name], f.default, f.metadata)
         for f in fields(kind)
@@ -117,7 +118,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     printable strings. Raises TypeError naming the field, and the errors of the dataclass for its
     values.
     """
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     if not isinstance(table, dict) or not table.keys() <= hints.keys():
         wrong = sorted(table.keys() - hints.keys()) if isinstance(table, dict) else table
         raise TypeError(f"{wrong!r} is none of {', '.join(hints)}")
@@ -134,13 +135,40 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     return made
 
 
+def check(rule: Any, where: str) -> None:
+    """Raises BundleError for a field of a rule of a bundle, a dataclass, whose value its type does
+    not allow. where: the rule's name in the manifest."""
+    for name, hint in _hints(type(rule)).items():
+        if not _fits(value := getattr(rule, name), hint):
+            raise BundleError(
+                f"{where}.{name} {shown(value)} must be {_words(hint)}; export the bundle again"
+            )
+
+
+def _words(hint: Any) -> str:
+    """The allowed values of a type, for a person."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind is Annotated:
+        return f"{_words(parts[0])}{' of length' * (get_origin(parts[0]) is tuple)} {parts[1]}"
+    if kind in (UnionType, Union):
+        return " or ".join(map(_words, parts))
+    if kind is tuple:
+        return f"a list in brackets, each {_words(parts[0])}"
+    if kind is Literal:
+        return "one of " + ", ".join(map(json.dumps, parts))
+    plain = {int: "a whole number", float: "a number", bool: "true or false"}
+    return plain.get(hint, "a string in quotes, without control characters")
+
+
 def _nested(hint: Any, value: Any) -> Any:
     """A JSON value for a field of type `hint`: lists as tuples, objects as dataclasses."""
+    if get_origin(hint) is Annotated:
+        return _nested(get_args(hint)[0], value)
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(_nested(get_args(hint)[0], v) for v in value)
     if get_origin(hint) is dict and isinstance(value, dict):
         return {name: _nested(get_args(hint)[1], v) for name, v in value.items()}
-    alternatives = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+    alternatives = get_args(hint) if get_origin(hint) in (UnionType, Union) else (hint,)
     kind: Any = next((k for k in alternatives if is_dataclass(k)), None)
     if kind is None or value is None or isinstance(value, kind):
         return value
@@ -149,7 +177,11 @@ def _nested(hint: Any, value: Any) -> Any:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Whether `value` from a file is allowed for a field of type `hint`."""
-    if get_origin(hint) is UnionType:
+    if get_origin(hint) is Annotated:
+        base, bounds = get_args(hint)
+        size = len(value) if isinstance(value, tuple) else value
+        return _fits(value, base) and bool(bounds.least <= size <= bounds.most)
+    if get_origin(hint) in (UnionType, Union):
         return any(_fits(value, part) for part in get_args(hint))
     if get_origin(hint) is Literal:
         return value in get_args(hint)

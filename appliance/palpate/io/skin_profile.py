@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import ceil
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from palpate.core.config import SkinConfig
 from palpate.core.errors import ConfigError
-from palpate.core.schema import custom, keys, read_table
-from palpate.core.schema import number as limited
+from palpate.core.schema import Within, custom, keys, read_table
 from palpate.core.settings_files import read_toml
 from palpate.core.text import closest, shown
 from palpate.core.types import MOST_AXES, SweepFormat
@@ -159,34 +158,34 @@ class SkinProfile:
         "palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf", "segments", "modbus"
     ] = "palpate"
     usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
-    baud: int = limited(115200, 1200, 4_000_000)
+    baud: Annotated[int, Within(1200, 4_000_000)] = 115200
     start: tuple[str, ...] = _several(
         'commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command
     )
     poll: tuple[str, ...] = _several('commands such as ["r"] or ["hex:01 42"]', _is_command)
     stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _is_command)
     tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _is_command)
-    tare_s: float = limited(0.0, 0.0, 60.0)
+    tare_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     marker: bytes = _hexadecimal(16)
     trailer: bytes = _hexadecimal(16)
-    skip_before: int = limited(0, 0, 4096)
-    skip_after: int = limited(0, 0, 4096)
+    skip_before: Annotated[int, Within(0, 4096)] = 0
+    skip_after: Annotated[int, Within(0, 4096)] = 0
     sequence: Literal["", "uint8", "uint16", "uint32"] = ""
-    sequence_at: int = limited(0, 0, 1 << 20)
+    sequence_at: Annotated[int, Within(0, 1 << 20)] = 0
     sequence_order: Literal["", "little", "big"] = ""
     checksum: str = _checksum()
-    checksum_from: int = limited(0, 0, 4096)
+    checksum_from: Annotated[int, Within(0, 4096)] = 0
     checksum_order: Literal["", "little", "big"] = ""
     index: str = _text(64)
-    index_at: int = limited(0, 0, 4096)
+    index_at: Annotated[int, Within(0, 4096)] = 0
     length: Literal["", "uint8", "uint16", "uint32"] = ""
-    length_at: int = limited(0, 0, 4096)
+    length_at: Annotated[int, Within(0, 4096)] = 0
     length_of: Literal["bytes", "numbers"] = "bytes"
-    segment: int = limited(0, 0, 1 << 16)
+    segment: Annotated[int, Within(0, 1 << 16)] = 0
     zeros: bool = False
-    unit_id: int = limited(1, 0, 255)
+    unit_id: Annotated[int, Within(0, 255)] = 1
     function: Literal[3, 4] = 3
-    register: int = limited(0, 0, 65535)
+    register: Annotated[int, Within(0, 65535)] = 0
     lines: Literal["rows", "frames", "taxels"] = "rows"
     skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
     prefix: str = _text(64)
@@ -195,14 +194,14 @@ class SkinProfile:
     line_end: Literal["\n", "\r"] = "\n"
     number: str = _number()
     byte_order: Literal["little", "big"] = "little"
-    rows: int = limited(4, 1, 255)
-    cols: int = limited(4, 1, 255)
-    values: int = limited(1, 1, 64)
+    rows: Annotated[int, Within(1, 255)] = 4
+    cols: Annotated[int, Within(1, 255)] = 4
+    values: Annotated[int, Within(1, 64)] = 1
     take: tuple[int, ...] = _several(
         "positions among the values of a taxel such as [1, 2, 3]", _is_channel, (0,)
     )
     orientation: tuple[str, ...] = _several(f"some of {', '.join(_TURNS)}", _TURNS.__contains__)
-    rate_hz: float = limited(100.0, 0.1, 100_000.0)
+    rate_hz: Annotated[float, Within(0.1, 100_000.0)] = 100.0
     rates_hz: tuple[float, ...] = _several("rates such as [100, 250]", _is_rate)
 
     def __post_init__(self) -> None:

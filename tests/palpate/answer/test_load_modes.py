@@ -10,7 +10,10 @@ from palpate.answer.taxels import bridged
 
 SPREAD = np.array([4.0, 8.0, 2.0, 6.0, 1.0, 5.0])
 TILT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-LOADS = LoadModes(tuple(20 * SPREAD), (tuple(5 * SPREAD), tuple(4 * TILT)), 1e-3)
+LOADS = LoadModes(
+    *(tuple((20 * SPREAD).tolist()), (tuple((5 * SPREAD).tolist()), tuple((4 * TILT).tolist()))),
+    1e-3,
+)
 """Six values that are pressed differently: a common force, and a tilt."""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer import disturbance
-from palpate.answer.disturbance import Allowance
+from palpate.answer.disturbance import Allowance, Name
 from palpate.answer.slide import SlideMeter
 from palpate.answer.unknown import shaped_distances
 from palpate.answer.window import TINY
@@ -21,7 +21,7 @@ from palpate_train.answer import fit_hum
 from palpate_train.answer.fit_unknown import DisturbedSweeps
 
 Array = NDArray[Any]
-MADE_BY = {
+MADE_BY: dict[tuple[Name, int], tuple[str, ...]] = {
     ("noise", 1): ("noise", "bits"),
     ("load", -1): ("gain-down",),
     ("load", 1): ("gain-up",),
@@ -195,9 +195,9 @@ def unnoticed(training: DisturbedSweeps, altered: DisturbedSweeps) -> DisturbedS
     return replace(altered, copies={kind: of for kind, of in copies.items() if len(of[1])})
 
 
-def _edges(training: DisturbedSweeps) -> dict[tuple[str, int], tuple[float, list[str]]]:
+def _edges(training: DisturbedSweeps) -> dict[tuple[Name, int], tuple[float, list[str]]]:
     """Where training ends, and the kinds of copies beyond it, by disturbance and sign."""
-    edges = {}
+    edges: dict[tuple[Name, int], tuple[float, list[str]]] = {}
     for (name, sign), kinds in MADE_BY.items():
         made = [kind for kind in kinds if kind in training.disturbed]
         start = _edge(name, sign, training.disturbed[made[0]][1]) if made else None
