@@ -107,9 +107,7 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             simulated = simulated or tubes(1)
             settings = load_settings(sets)
             far_end, name = stack.enter_context(pseudo_terminal.pair())
-            port = SerialSink(
-                replace(settings.serial, port=name), simulated.clock, simulated.source
-            )
+            port = SerialSink(replace(settings.serial, port=name), simulated.clock)
             kept: list[Sweep] = []
             watching = [OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers]
             if commands is None:

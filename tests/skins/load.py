@@ -141,7 +141,7 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         trigger = replace(settings.trigger, sweep_s=sweep_s, every_s=sweep_s + PAUSE_S)
         settings = replace(settings, trigger=trigger)
         far_end, port = stack.enter_context(pseudo_terminal.pair())
-        sink = SerialSink(replace(settings.serial, port=port), clock, "emulator")
+        sink = SerialSink(replace(settings.serial, port=port), clock)
         box = assembly.box(settings, current, Devices(clock), sink, stack, observers=[check])
         _turns(box, far_end, SETTLE_S)
         check.clear()

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
+from palpate.core.config import ClassifierConfig
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
@@ -20,16 +21,6 @@ compares it with other rules."""
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
 all others."""
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectRule:
-    """The settings by which an object ends (ClassifierConfig). With the defaults here only NEW
-    OBJECT ends it."""
-
-    max_sweeps: int = 0
-    conflict: str = "fuse"
-    object_s: float = 0.0
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
@@ -129,7 +120,7 @@ class FusedSweeps:
     last: int = 0
     end_ns: int = 0
 
-    def ended(self, start_ns: int, rule: ObjectRule) -> bool:
+    def ended(self, start_ns: int, rule: ClassifierConfig) -> bool:
         """Whether a sweep that starts at `start_ns` comes after a pause, or after `max_sweeps`
         sweeps."""
         paused = 0 < rule.object_s * 1e9 < start_ns - self.end_ns
@@ -150,20 +141,20 @@ def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
 
 
 class ObjectSweeps:
-    """Fuses the sweeps of one object after the other. labels: [K], for messages. fusion: "product",
-    "vote" (see `Evidence.of`) or "none"."""
+    """Fuses the sweeps of one object after the other. labels: [K], for messages. rule: how they are
+    fused, and when an object ends."""
 
     def __init__(
-        self, labels: Sequence[str], fusion: str, rule: ObjectRule, enrolled: EnrolledLabels
+        self, labels: Sequence[str], rule: ClassifierConfig, enrolled: EnrolledLabels
     ) -> None:
-        self.fusion, self.rule, self.enrolled = fusion, rule, enrolled
+        self.rule, self.enrolled = rule, enrolled
         self.present = FusedSweeps()
         self._labels = labels
 
     def apply(self, context: Context) -> Refusal | None:
         """Fuse one more sweep with those of its object, and refuse one that contradicts them."""
         sweep, own, earlier = context.sweep, context.probabilities, self.present
-        if sweep.object == 0 or sweep.object != earlier.object or self.fusion == "none":
+        if sweep.object == 0 or sweep.object != earlier.object or self.rule.fuse == "none":
             earlier = FusedSweeps(sweep.object)
         before = None if earlier.ended(sweep.start_ns, self.rule) else earlier.evidence
         conflict = self._conflict(own, before)
@@ -171,9 +162,11 @@ class ObjectSweeps:
         if conflict and self.rule.conflict == "refuse":
             self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
             return Refusal(Status.CONFLICT, conflict)
-        votes = self.fusion == "vote"  # each sweep votes for the label that it is given
+        votes = self.rule.fuse == "vote"  # each sweep votes for the label that it is given
         kept = Evidence.of(
-            self.enrolled.decided(own) if votes else own, self.fusion, None if conflict else before
+            self.enrolled.decided(own) if votes else own,
+            self.rule.fuse,
+            None if conflict else before,
         )
         self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
         fused = kept.probabilities

@@ -87,43 +87,47 @@ def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
     return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
 
 
+def check(
+    held: Mapping[str, NDArray[Any]],
+    wanted: Mapping[str, tuple[str, tuple[int, ...]]],
+    file: str,
+    advice: str = "export the bundle again",
+) -> None:
+    """Raises BundleError for an array of `file` that has another type or shape than `wanted`, or a
+    number that is not finite."""
+    for name, (kind, shape) in wanted.items():
+        values = held[name]
+        if values.dtype != kind or values.shape != shape:
+            given = f"{file} holds {name} {values.dtype} {list(values.shape)}"
+            raise BundleError(f"{given}; {kind} {list(shape)} is wanted: {advice}")
+        if not np.isfinite(values).all():
+            raise BundleError(f"{file} holds {name} that are not finite; {advice}")
+
+
 def check_classes(
     arrays: Mapping[str, NDArray[Any]], n: int, steps: int, disturbances: int = 0
 ) -> None:
     """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels,
     `steps` early answers and this number of disturbances, or has a number out of range."""
-    rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
-    rows = {
-        "means": (n, rank),
-        "bias": (n,),
-        "sweeps": (n,),
-        "spread": (n,),
-        "shapes": (n, 0, 0),
-        "displaced_turn": (rank, rank),
-        "displaced_means": (n, rank),
-        "displaced_shapes": (n, 0, 0),
-        "early_means": (steps, n, rank),
-        "early_shapes": (steps, rank, rank),
-        "changes": (disturbances, int((arrays["sweeps"] == 0).sum()), rank),
+    rank = max(1, arrays["means"].shape[-1]) if arrays["means"].ndim else 1
+    trained = int((arrays["sweeps"] == 0).sum())
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        "means": ("float32", (n, rank)),
+        "bias": ("float32", (n,)),
+        "sweeps": ("int64", (n,)),
+        "spread": ("float32", (n,)),
+        "displaced_turn": ("float32", (rank, rank)),
+        "displaced_means": ("float32", (n, rank)),
     }
-    halves = dict.fromkeys(("shapes", "displaced_shapes", "early_shapes", "changes"), "float16")
-    kinds = {"sweeps": "int64"} | halves
-    for name, wanted in rows.items():
-        unused = not steps if name.startswith("early_") else name == "changes" and not disturbances
-        if name not in arrays or unused:
-            continue
-        values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
-        if name in ("shapes", "displaced_shapes") and len(shape) == 3 and shape[1] <= rank:
-            wanted = (n, shape[1], shape[1])
-        if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
-            raise BundleError(
-                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} "
-                f"{list(wanted)} is wanted, a row a label"
-            )
-        if not np.isfinite(values).all():
-            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
+    if steps:
+        wanted["early_means"] = ("float32", (steps, n, rank))
+        wanted["early_shapes"] = ("float16", (steps, rank, rank))
+    if disturbances:
+        wanted["changes"] = ("float16", (disturbances, trained, rank))
+    for name in ("shapes", "displaced_shapes"):
+        side = min([rank, *arrays[name].shape[1:2]]) if name in arrays else 0
+        wanted[name] = ("float16", (n, side, side))
+    check(arrays, {name: of for name, of in wanted.items() if name in arrays}, MEANS)
     if not (arrays["spread"] > 0).all():
-        raise BundleError(
-            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the "
-            "bundle again"
-        )
+        given = f"{MEANS} holds spread {arrays['spread'].tolist()}"
+        raise BundleError(f"{given}, which must be above 0; export the bundle again")

@@ -160,28 +160,17 @@ def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
     `bundle`."""
     assert bundle.classes
     f = bundle.format
-    logits = ("float32", (len(bundle.golden) + n, len(bundle.manifest.labels) + n))
-    wanted = {
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
         "means": ("float32", (n, bundle.classes.means.shape[1])),
         "sweeps": ("int64", (n,)),
         "spread": ("float32", (n,)),
         "changes": ("uint8", (f.numpy_type.itemsize, n, f.window, *f.shape)),
-        "logits": logits,
+        "logits": ("float32", (len(bundle.golden) + n, len(bundle.manifest.labels) + n)),
         "least": ("float64", ()),
     }
-    for name in wanted:
-        values, (kind, shape) = held[name], wanted[name]
-        if values.dtype != kind or values.shape != shape:
-            raise BundleError(
-                f"{ENROLMENT} holds {name} {values.dtype} {list(values.shape)}; {kind} "
-                f"{list(shape)} is wanted: {AGAIN}"
-            )
-        if not np.isfinite(values).all():
-            raise BundleError(f"{ENROLMENT} holds {name} that are not finite; {AGAIN}")
-    if (
-        not ((held["sweeps"] >= 1) & (held["sweeps"] <= MOST_SWEEPS)).all()
-        or not (held["spread"] >= 1).all()
-    ):
+    arrays.check(held, wanted, ENROLMENT, AGAIN)
+    sweeps = held["sweeps"]
+    if not (((sweeps >= 1) & (sweeps <= MOST_SWEEPS)).all() and (held["spread"] >= 1).all()):
         raise BundleError(
             f"{ENROLMENT} holds a number of sweeps or a spread below 1, or too many; {AGAIN}"
         )

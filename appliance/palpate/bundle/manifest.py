@@ -30,8 +30,8 @@ SCHEMA = 1
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 MOST_BYTES = 64 << 20
-"""Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
-a model needs shows in its trial."""
+"""Largest file, and largest constant, input or output of a model. The largest of our models, the
+paper's network in int8, has 16 MB. The memory that a model needs shows in its trial."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
@@ -44,9 +44,6 @@ class Thresholds(WindowLimits):
     """
 
     unsure: Annotated[float, Within(0, MOST)] = UNSURE  # above 1 no sweep is ok
-
-    def __post_init__(self) -> None:
-        check(self, "thresholds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +94,7 @@ class Manifest:
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
+        check(self.thresholds, "thresholds")
         for why in _faults(self):
             raise BundleError(f"manifest {why}; export the bundle again")
         version(self.runtime)
@@ -169,7 +167,7 @@ def _wrong_parts(m: Manifest) -> Iterator[str]:
     if m.displacement and not (m.known and m.contact):
         yield "has `displacement` without `known` and `contact`"
     if m.thresholds.dead_taxels >= taxels:
-        yield f"tolerates {m.thresholds.dead_taxels} dead taxels of {taxels}, which leaves none"
+        yield f"has {m.thresholds.dead_taxels} of {taxels} for thresholds.dead_taxels: none is left"
     if m.bridging and m.bridging.taxels >= taxels:
         yield f"bridges {m.bridging.taxels} of {taxels} taxels, which leaves none"
     loads = m.bridging and m.bridging.loads

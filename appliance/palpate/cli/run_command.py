@@ -22,6 +22,7 @@ from palpate.core.interrupts import StopFlag
 from palpate.core.log import in_journal, log
 from palpate.core.observer import Facts, Observer
 from palpate.deployment import release_trial, releases
+from palpate.inference.classifier import Classifier
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
@@ -152,7 +153,7 @@ def _shadow(
         from palpate.deployment.shadow import Shadow
 
         folder = Path(settings.store.folder) / "shadow"
-        made = partial(assembly.classifier, settings, clock=devices.clock)
+        made = partial(Classifier, clock=devices.clock, settings=settings.classifier)
         return Shadow(candidate, current, folder, devices.clock, made, disk)
     except (ApplianceError, OSError) as e:  # the box serves the robot, this is for a person
         log.warning(f"no shadow: {e}")

@@ -61,7 +61,7 @@ def run_demo(args: argparse.Namespace) -> int:
     stopped = StopFlag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
-        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        port = SerialSink(replace(settings.serial, port=name), devices.clock)
         labels = bundle.manifest.labels
         show = demo.Demo(devices.robot.played, far_end, sys.stdout, labels, raw=args.raw)
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
@@ -84,7 +84,7 @@ def run_bench(args: argparse.Namespace) -> int:
         devices: SimDevices, stack: ExitStack, observers: Iterable[Observer] = ()
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
-        port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
+        port = SerialSink(replace(settings.serial, port=name), devices.clock)
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack, observers=observers)
         return box, far_end
 

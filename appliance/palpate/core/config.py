@@ -172,6 +172,10 @@ class ClassifierConfig:
     strangers: Literal["strict", "balanced", "loose"] = "balanced"
 
 
+UNTIL_NEW_OBJECT = ClassifierConfig(max_sweeps=0, conflict="fuse", object_s=0.0)
+"""With these settings only NEW OBJECT ends an object."""
+
+
 @dataclass(frozen=True, slots=True)
 class StoreConfig:
     """The folders of the box.

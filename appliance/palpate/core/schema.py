@@ -32,8 +32,8 @@ class Within:
 
     def __str__(self) -> str:
         if self.least == LEAST:
-            return f"above 0, up to {self.most:.3g}"
-        return f"from {self.least} to {self.most}"
+            return "above 0" + f" up to {self.most:g}" * (self.most < MOST)
+        return f"from {self.least} to {self.most}" if self.most < MOST else f"from {self.least} on"
 
 
 LEAST, MOST = math.ulp(0.0), sys.float_info.max
@@ -130,8 +130,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
     made = kind(**values)
     for name, value in values.items():
         if not _fits(value, hints[name]):
-            wanted = getattr(hints[name], "__name__", hints[name])
-            raise TypeError(f"{kind.__name__}.{name} = {value!r} is not of type {wanted}")
+            raise TypeError(f"{kind.__name__}.{name} = {value!r} must be {_words(hints[name])}")
     return made
 
 
@@ -149,15 +148,16 @@ def _words(hint: Any) -> str:
     """The allowed values of a type, for a person."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind is Annotated:
-        return f"{_words(parts[0])}{' of length' * (get_origin(parts[0]) is tuple)} {parts[1]}"
+        return f"{_words(parts[0])}{', its length' * (get_origin(parts[0]) is tuple)} {parts[1]}"
     if kind in (UnionType, Union):
         return " or ".join(map(_words, parts))
     if kind is tuple:
-        return f"a list in brackets, each {_words(parts[0])}"
+        return f"a list, each {_words(parts[0])}"
     if kind is Literal:
         return "one of " + ", ".join(map(json.dumps, parts))
-    plain = {int: "a whole number", float: "a number", bool: "true or false"}
-    return plain.get(hint, "a string in quotes, without control characters")
+    plain: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false"}
+    plain |= {str: "a string in quotes, without control characters", type(None): "null"}
+    return plain.get(hint, getattr(hint, "__name__", str(hint)))
 
 
 def _nested(hint: Any, value: Any) -> Any:

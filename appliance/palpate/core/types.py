@@ -243,14 +243,14 @@ class Verdict:
     sweep: int
     time_ns: int
     status: Status
-    label: str
-    probability: float
-    margin: float
-    scores: NDArray[np.float64]
-    fused: int
-    lost: int
-    latency_ns: int
-    bundle: str
+    label: str = ""
+    probability: float = 0.0
+    margin: float = 0.0
+    scores: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    fused: int = 0
+    lost: int = 0
+    latency_ns: int = 0
+    bundle: str = ""
     detail: str = ""
     share: float = 1.0
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
@@ -263,26 +263,17 @@ class Verdict:
     direction: str | None = None
 
     @classmethod
-    def without_label(
-        cls, sweep: Sweep, status: Status, detail: str, now_ns: int, bundle: str
-    ) -> Verdict:
-        """The answer to a sweep that was not classified."""
+    def of(cls, sweep: Sweep, status: Status, now_ns: int, bundle: str, **found: Any) -> Verdict:
+        """The answer to a sweep, without a label unless that was found."""
         return cls(
-            sweep=sweep.id,
-            time_ns=now_ns,
-            status=status,
-            label="",
-            probability=0.0,
-            margin=0.0,
-            scores=np.empty(0),
-            fused=0,
+            *(sweep.id, now_ns, status),
             lost=sweep.lost,
             latency_ns=now_ns - sweep.complete_ns,
             bundle=bundle,
-            detail=detail,
             share=sweep.share,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
+            **found,
         )
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:

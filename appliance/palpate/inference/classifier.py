@@ -7,6 +7,7 @@ a status with the reason instead of a label.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from palpate.answer.objects import (
     EnrolledLabels,
     FusedSweeps,
     GivesNumbers,
-    ObjectRule,
     ObjectSweeps,
     softmax,
 )
@@ -33,15 +33,18 @@ from palpate.answer.vibration import Vibrates
 from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from palpate.bundle.manifest import MEANS
+from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.errors import BundleError
 from palpate.core.observer import Observer
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, entries
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.inference.session import ModelRunner
 
 if TYPE_CHECKING:
     from palpate.core.clock import Clock
 
 
+RULE = ("fuse", "min_probability", "max_sweeps", "conflict", "object_s", "strangers")
+"""The settings of the classifier that a sidecar holds as `rule`."""
 UNCERTAIN = Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN
 
 
@@ -67,7 +70,7 @@ def class_distances(
 class Classifier(Observer):
     """Runs one bundle in one thread.
 
-    Sweeps with the same `object` number above 0 are fused, until the object ends (ObjectRule).
+    Sweeps with the same `object` number above 0 are fused, until the object ends (FusedSweeps).
     Without NEW OBJECT each sweep is answered by itself. The sweeps of an object are a sequential
     test: `unsure` asks for one more sweep, until the probability is at least `min_probability` (ok)
     or `max_sweeps` were fused (undecided, the final answer).
@@ -76,12 +79,9 @@ class Classifier(Observer):
     limit, temperature and least probability apply. An unknown sweep is not fused: it has no
     probabilities, and one touch beside the object must not invalidate the other sweeps.
 
-    fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 means the bundle's
-    thresholds.unsure. max_sweeps, conflict, object_s: as in ObjectRule; by default only NEW OBJECT
-    ends an object. strangers: the limit of known materials, "strict", "balanced" or "loose".
-    slides: whether answers have the speed of the slide; without it they take less time. Raises
-    BundleError if onnxruntime refuses the model. `bundle.load` has compared its inputs and outputs
-    with the manifest.
+    settings: a min_probability of 0 becomes the bundle's thresholds.unsure. slides: whether answers
+    have the speed of the slide; without it they take less time. Raises BundleError if onnxruntime
+    refuses the model. `bundle.load` has compared its inputs and outputs with the manifest.
 
     taxels: the broken taxels. As an observer of the loop it searches the stream for them; without a
     stream they are found in each window alone.
@@ -91,27 +91,18 @@ class Classifier(Observer):
         self,
         bundle: Bundle,
         clock: Clock,
-        fusion: str = "product",
-        min_probability: float = 0.0,
-        max_sweeps: int = 0,
-        conflict: str = "fuse",
-        object_s: float = 0.0,
-        strangers: str = "balanced",
+        settings: ClassifierConfig = UNTIL_NEW_OBJECT,
         slides: bool = True,
     ) -> None:
-        self.bundle = bundle
-        self.min_probability = min_probability or bundle.manifest.thresholds.unsure
-        self.strangers, self._clock = strangers, clock
-        self._objects = ObjectSweeps(
-            bundle.manifest.labels,
-            fusion,
-            ObjectRule(max_sweeps, conflict, object_s),
-            enrolled_labels(bundle),
-        )
+        self.bundle, self._clock = bundle, clock
+        least = settings.min_probability or bundle.manifest.thresholds.unsure
+        self.settings = replace(settings, min_probability=least)
+        labels, enrolled = bundle.manifest.labels, enrolled_labels(bundle)
+        self._objects = ObjectSweeps(labels, self.settings, enrolled)
         m = bundle.manifest
         self.tare = m.tare
         self.taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
-        self._means = class_distances(bundle, strangers)
+        self._means = class_distances(bundle, settings.strangers)
         self._outputs = ("logits", *("embedding",) * (self._means is not None))
         # early heads get a session of their own
         self._model = ModelRunner(bundle.model, *self._outputs)
@@ -121,7 +112,7 @@ class Classifier(Observer):
         self._measuring, self._judging = self._measures(slides), self._judges()
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
-            displaced = class_distances(bundle, strangers, displaced=True)
+            displaced = class_distances(bundle, settings.strangers, displaced=True)
             network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
 
@@ -155,7 +146,7 @@ class Classifier(Observer):
             stages.append(ShowsPattern(m.sliding.pattern, self._slide))
         if m.sliding:
             stages.append(Vibrates(m.sliding, m.labels, m.format.window, enrolled, m.disturbances))
-        least = self.min_probability
+        least = self.settings.min_probability
         displaced = max(least, rule.unsure if rule else 0.0)
         return [*stages, self._objects, Certain(least, displaced)]
 
@@ -163,12 +154,7 @@ class Classifier(Observer):
     def rule(self) -> dict[str, Any]:
         """The classifier's settings under their names in the site file. They are written to
         sidecars, and a replay applies them again."""
-        return {
-            "fuse": self._objects.fusion,
-            "min_probability": self.min_probability,
-            **entries(self._objects.rule),
-            "strangers": self.strangers,
-        }
+        return {name: getattr(self.settings, name) for name in RULE}
 
     @property
     def format(self) -> SweepFormat:
@@ -326,27 +312,18 @@ class Classifier(Observer):
         if len(scores):
             label = self.bundle.manifest.labels[scores.argmax()]
             *_, second, best = sorted(scores.tolist())
-        now = self._clock.now_ns()
-        return Verdict(
-            sweep=sweep.id,
-            time_ns=now,
-            status=context.status,
+        return Verdict.of(
+            *(sweep, context.status, self._clock.now_ns(), self.bundle.id),
             label=label,
             probability=best,
             margin=best - second,
             scores=scores,
             fused=context.fused,
-            lost=sweep.lost,
-            latency_ns=now - sweep.complete_ns,
-            bundle=self.bundle.id,
             detail=self._detail(context),
-            share=sweep.share,
             own=context.own,
             displacement=context.displacement.text,
             degraded=context.degraded or "",
             after=context.after,
-            speed_mm_s=sweep.speed_mm_s,
-            force_n=sweep.force_n,
             measured_mm_s=context.slide.speed_mm_s,
             direction=context.slide.direction,
         )

@@ -32,7 +32,7 @@ class EarlyExit:
         self._classifier, self.steps = classifier, len(manifest.early.least)
         classes, limits = classifier.bundle.classes, manifest.early.limits
         if manifest.known:  # the limits are strict already: a loose choice does not widen them
-            growth = min(1.0, manifest.known.growth(classifier.strangers))
+            growth = min(1.0, manifest.known.growth(classifier.settings.strangers))
             limits = tuple(growth * limit for limit in limits)
         distances = EarlyDistances(classes.early, limits) if classes and classes.early else None
         outputs = ("early", *("early_embedding",) * (distances is not None))

@@ -11,7 +11,7 @@ import errno
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from palpate.core.errors import LineError
 from palpate.core.text import closest
@@ -230,9 +230,3 @@ class Lines:
                 with naming("write", changed.values()):
                     request.set_values({o: level[new[n]] for o, n in changed.items()})
                 self._levels.update({name: new[name] for name in changed.values()})
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

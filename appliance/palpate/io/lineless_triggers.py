@@ -15,7 +15,6 @@ import termios
 import tty
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Self
 
 from palpate.core.clock import Clock
 from palpate.core.config import TriggerConfig
@@ -148,12 +147,6 @@ class KeyTrigger(LinelessTrigger):
             termios.tcsetattr(self._terminal, termios.TCSANOW, self._before)
         except termios.error:
             return
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _keys(self) -> bytes:
         try:

@@ -246,7 +246,6 @@ def unpack_identity(payload: bytes) -> Identity:
 
 
 def pack_format(skin: SkinFormat) -> bytes:
-    code, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
     grid, rate_mhz = (skin.rows, skin.cols), round(skin.rate_hz * 1000)
     code, axes = DATA_TYPES.index(skin.dtype), _axes_byte(skin.axes)
     return _FORMAT.pack(*grid, code, axes, rate_mhz, skin.fifo_frames, skin.packet_frames)

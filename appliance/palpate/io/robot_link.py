@@ -95,13 +95,10 @@ class StdoutPort:
     of commands, since standard output has none. name: for messages. dropped: number of sentences
     that were not sent. trouble: the reason why the line does not work, "" if it does."""
 
-    def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
+    def __init__(self, commands: Callable[[], list[Command]] = list) -> None:
         self.name, self.dropped, self.trouble = "standard output", 0, ""
-        self._source, self._commands = source, commands
+        self._commands = commands
         self._gone = False  # the reader of a pipe
-
-    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
@@ -149,11 +146,10 @@ class SerialSink:
         self,
         config: SerialConfig,
         clock: Clock,
-        source: str,
         opener: Callable[..., Any] = serial.Serial,
     ) -> None:
         self.name, self.dropped, self.trouble = config.port, 0, ""
-        self._config, self._clock, self._source, self._opener = config, clock, source, opener
+        self._config, self._clock, self._opener = config, clock, opener
         self._port: Any = None
         self._retry_ns = clock.now_ns()
         self._queue: deque[bytes] = deque()
@@ -161,10 +157,6 @@ class SerialSink:
         self._rest = b""
         self._refused = 0  # bad lines since the last command
         self._refusal_ns = clock.now_ns()
-
-    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Queue a verdict's sentence and send as much as the port accepts now."""
-        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Queue a sentence. Of a full queue the oldest that was not begun is dropped."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol
 
 from palpate.core.types import Edge, EdgeKind
 from palpate.io.gpio_lines import check_binding, line_error, naming, request_lines
@@ -151,12 +151,6 @@ class GpioTrigger:
     def close(self) -> None:
         """Release the lines."""
         self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _read(self, line: _Line, now_ns: int) -> None:
         """Read one line's share of the `storm_edges` events of a call."""

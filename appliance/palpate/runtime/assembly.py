@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,7 @@ from typing import Any
 
 from palpate.bundle import bundle as bundles
 from palpate.bundle.bundle import Bundle
-from palpate.core.clock import Clock, SystemClock
+from palpate.core.clock import SystemClock
 from palpate.core.config import Config, TriggerConfig
 from palpate.core.devices import Devices
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
@@ -59,7 +59,7 @@ def box(
     **more: Any,
 ) -> Box:
     """The box that classifies; `stack` closes it again. more: as for `assembled`."""
-    run = classifier(settings, bundle, devices.clock)
+    run = Classifier(bundle, devices.clock, settings.classifier)
     run.self_test()
     more |= {"codes": bundle.manifest.labels, "early": early_exit(settings, run)}
     return assembled(settings, run, devices, port, stack, **more)
@@ -136,7 +136,7 @@ def _trigger(
             )
         return CommandTrigger(devices.clock, devices.commanded)
     if config.mode == "key":
-        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, log.info))
+        return stack.enter_context(closing(KeyTrigger(standard_input(), devices.clock, log.info)))
     if config.mode == "timed":
         window_s = format.window / format.rate_hz
         if config.sweep_s < window_s:
@@ -152,7 +152,7 @@ def _trigger(
             "to serial, key or timed, which need no lines (here --trigger serial), or choose a "
             "board with --board"
         )
-    return stack.enter_context(GpioTrigger(config, gpio(devices)))
+    return stack.enter_context(closing(GpioTrigger(config, gpio(devices))))
 
 
 def _label(labels: tuple[str, ...], code: str) -> list[object]:
@@ -171,7 +171,7 @@ def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | No
     out = settings.output
     if not any((out.ready, out.busy, out.result_valid, out.fault, out.decided, *out.class_bits)):
         return None
-    return stack.enter_context(Lines(out, gpio(devices), devices.clock))
+    return stack.enter_context(closing(Lines(out, gpio(devices), devices.clock)))
 
 
 def gpio(devices: Devices) -> Any:
@@ -183,21 +183,13 @@ def gpio(devices: Devices) -> Any:
     return gpiod
 
 
-def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
-    chosen = settings.classifier
-    return Classifier(
-        *(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps),
-        *(chosen.conflict, chosen.object_s, chosen.strangers),
-    )
-
-
 def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
     return EarlyExit(run) if settings.classifier.early else None
 
 
 def prove(settings: Config, bundle: Bundle) -> None:
     """Raises BundleError or ConfigError if this machine does not run a bundle correctly."""
-    run = classifier(settings, bundle, SystemClock())
+    run = Classifier(bundle, SystemClock(), settings.classifier)
     run.self_test()
     early_exit(settings, run)
     if settings.output.class_bits:
@@ -237,5 +229,5 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
 def port(settings: Config, devices: Devices) -> Port | None:
     """The serial line, or standard output; none in the journal, which people read."""
     if settings.serial.port:
-        return SerialSink(settings.serial, devices.clock, devices.source)
-    return None if in_journal() else StdoutPort(devices.source)
+        return SerialSink(settings.serial, devices.clock)
+    return None if in_journal() else StdoutPort()

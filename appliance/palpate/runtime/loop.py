@@ -24,7 +24,7 @@ from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entrie
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.gpio_lines import Lines
-from palpate.io.robot_link import Command, Port
+from palpate.io.robot_link import Command, Port, result
 from palpate.io.sensor import Sensor, SensorCounters
 from palpate.io.trigger import Trigger
 from palpate.sweeps.sweep_check import SweepCheck
@@ -179,7 +179,7 @@ class Box:
     def _aborted(self, sweep: Sweep, now_ns: int) -> Verdict:
         """The answer to a sweep that was cut but not classified."""
         status = Status.ABORTED if sweep.status is Status.OK else sweep.status
-        return Verdict.without_label(sweep, status, "", now_ns, self._answerer.model)
+        return Verdict.of(sweep, status, now_ns, self._answerer.model)
 
     def _notify(self, event: str, *content: Any) -> None:
         """Call the observers. Only expected errors of the outputs stop the loop."""
@@ -244,7 +244,7 @@ class Box:
             self._failures, self._sound = self._failures + 1, 0
             self._failure = str(e) or type(e).__name__
             now_ns, model = self._clock.now_ns(), self._answerer.model
-            return Verdict.without_label(sweep, Status.FAILED, self._failure, now_ns, model)
+            return Verdict.of(sweep, Status.FAILED, now_ns, model, detail=self._failure)
         self._sound += sweep.status is Status.OK
         if self._sound >= SOUND:
             self._failures = self._sound = 0
@@ -260,7 +260,8 @@ class Box:
 
     def _send(self, verdict: Verdict) -> None:
         if self._port:
-            self._port.send(verdict, loss_known=self._sensor.loss_known)
+            known = self._sensor.loss_known
+            self._port.say(result(verdict, self._source, loss_known=known))
         if self._unanswered:
             self._unanswered.popleft()
         self.answered += 1

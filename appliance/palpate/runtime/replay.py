@@ -22,7 +22,7 @@ from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
-from palpate.inference.classifier import Classifier
+from palpate.inference.classifier import RULE, Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort, result
 from palpate.runtime import assembly
@@ -38,8 +38,6 @@ SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not 
 LATEST = 500
 """Number of the latest sweeps that a new release must answer as before."""
 CLASSIFIED = {status for status in Status if status.classified}
-RULE = ("fuse", "min_probability", "max_sweeps", "conflict", "object_s", "strangers")
-"""The settings of the classifier that a sidecar holds as `rule`."""
 
 
 class OtherBundle(FormatError):
@@ -183,8 +181,7 @@ class SweepReplay:
         if self._classifier is None or made != self._made:
             self._made = made
             rule = kept.rule or self._settings.classifier
-            settings = replace(self._settings, classifier=rule)
-            self._classifier = assembly.classifier(settings, self._bundle, self._clock)
+            self._classifier = Classifier(self._bundle, self._clock, rule)
         self._classifier.tare = self._bundle.manifest.tare if kept.tare is None else kept.tare
         self._classifier.taxels.broken = kept.broken
         self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)
@@ -306,8 +303,8 @@ def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
     """Run the box on a capture, which replaces sensor, trigger, clock and commands."""
     play = Playback(path)
     _check(str(path), play.format, bundle)
-    classifier = assembly.classifier(settings, bundle, play)
-    port = StdoutPort("replay", play.commands)
+    classifier = Classifier(bundle, play, settings.classifier)
+    port = StdoutPort(play.commands)
     cutter = SweepCutter(bundle.format, settings.sweep)
     box = Box(
         *(play, play, cutter, classifier, play),

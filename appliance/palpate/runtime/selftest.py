@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 from palpate.answer.slide import SlideMeter
@@ -207,8 +208,8 @@ def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
 def _lines(settings: Config, devices: Devices) -> str:
     module = gpio(devices)
     with (
-        GpioTrigger(settings.trigger, module),
-        Lines(settings.output, module, devices.clock) as lines,
+        closing(GpioTrigger(settings.trigger, module)),
+        closing(Lines(settings.output, module, devices.clock)) as lines,
     ):
         codes = lines.capacity
     inputs = [
@@ -218,7 +219,7 @@ def _lines(settings: Config, devices: Devices) -> str:
 
 
 def _port(settings: Config, devices: Devices) -> str:
-    port = SerialSink(settings.serial, devices.clock, devices.source)
+    port = SerialSink(settings.serial, devices.clock)
     port.commands()
     trouble = port.trouble
     port.close()

@@ -61,7 +61,7 @@ class SweepCheck(Observer):
             if self._slides and not finding.status.faulty:
                 finding = self._slid(sweep.frames.taxels) or finding
         now_ns = self._clock.now_ns()
-        return Verdict.without_label(sweep, finding.status, finding.detail, now_ns, self.model)
+        return Verdict.of(sweep, finding.status, now_ns, self.model, detail=finding.detail)
 
     def _slid(self, taxels: NDArray[Any]) -> Finding | None:
         """Why a window is not a slide, None if it is one."""

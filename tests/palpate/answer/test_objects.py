@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer.objects import LEAST_PROBABILITY, FusedSweeps, ObjectRule, contradicts, softmax
+from palpate.answer.objects import LEAST_PROBABILITY, FusedSweeps, contradicts, softmax
 from palpate.bundle.bundle import Bundle
-from palpate.core.config import ClassifierConfig
+from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
-from palpate.runtime import assembly
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
@@ -29,16 +28,12 @@ A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 S = 1_000_000_000
 ANOTHER = "another object: "
 DELIVERED = ClassifierConfig()
-UNTIL_NEW_OBJECT = ClassifierConfig(max_sweeps=0, conflict="fuse", object_s=0)
-"""The settings with which only NEW OBJECT ends an object."""
+PAUSED = replace(UNTIL_NEW_OBJECT, object_s=60.0)
 
 
 def classifier(bundle: Bundle, settings: ClassifierConfig = DELIVERED, **more: Any) -> Classifier:
     """A classifier with these settings."""
-    chosen = asdict(replace(settings, **more))
-    names = ("min_probability", "max_sweeps", "conflict", "object_s")
-    rule = {name: chosen[name] for name in names}
-    return Classifier(bundle, VirtualClock(), chosen["fuse"], **rule)
+    return Classifier(bundle, VirtualClock(), replace(settings, **more))
 
 
 def timed(sweeps: Iterable[Sweep], pause_s: float = 7) -> list[Sweep]:
@@ -89,10 +84,10 @@ def test_a_bayes_factor_of_ten_contradicts(labels):
 def test_a_pause_is_from_the_end_to_the_start():
     """More than object_s ends an object; 0 never does. A sweep before the end is not a pause."""
     before = FusedSweeps(1, (np.ones(2) / 2,), 1, 100 * S)
-    assert not before.ended(160 * S, ObjectRule(object_s=60))
-    assert before.ended(160 * S + 1, ObjectRule(object_s=60))
-    assert not before.ended(10**6 * S, ObjectRule(object_s=0))
-    assert not before.ended(0, ObjectRule(object_s=60))
+    assert not before.ended(160 * S, PAUSED)
+    assert before.ended(160 * S + 1, PAUSED)
+    assert not before.ended(10**6 * S, UNTIL_NEW_OBJECT)
+    assert not before.ended(0, PAUSED)
 
 
 def test_a_contradiction_begins_another_object(toy):
@@ -231,11 +226,11 @@ def test_new_object_forgotten(default_bundle, order):
 
 
 def test_the_settings_reach_the_classifier(toy):
-    """Box, shadow and replays use `assembly.classifier`; the rule is with each sweep."""
+    """Box, shadow and replays use the same ones; the rule is with each sweep."""
     sets = ("conflict=refuse", "object_s=7.5", "max_sweeps=3", "fuse=vote", "min_probability=0.6")
     for given in ((), sets):
         settings = load([f"classifier.{text}" for text in given])
-        rule = assembly.classifier(settings, toy, VirtualClock()).rule
+        rule = Classifier(toy, VirtualClock(), settings.classifier).rule
         chosen = asdict(settings.classifier)
         chosen["min_probability"] = chosen["min_probability"] or toy_bundle.LIMITS.unsure
         assert rule.keys() >= {"fuse", "min_probability", "max_sweeps", "conflict", "object_s"}

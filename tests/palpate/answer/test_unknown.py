@@ -15,6 +15,7 @@ from palpate.answer.objects import softmax
 from palpate.answer.unknown import KEPT, EarlyClasses, EarlyDistances
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
@@ -62,7 +63,7 @@ def displaced_box(tmp_path: Path) -> Classifier:
     """The toy bundle with a rule for displacement."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
     made = toy_bundle.load(tmp_path / "toy", arrays=arrays, **DISPLACED)
-    return Classifier(made, VirtualClock(), max_sweeps=2)
+    return Classifier(made, VirtualClock(), replace(UNTIL_NEW_OBJECT, max_sweeps=2))
 
 
 def test_a_material_has_its_own_shape(displaced_box):
@@ -98,7 +99,9 @@ def test_a_displaced_sweep_needs_its_own_probability(displaced_box):
     assert (first.status, first.label) == (Status.UNSURE, "a")
     assert first.probability == pytest.approx(q, abs=1e-3)
     assert (second.status, second.fused) == (Status.OK, 2)
-    least = Classifier(displaced_box.bundle, VirtualClock(), min_probability=0.99)
+    least = Classifier(
+        displaced_box.bundle, VirtualClock(), replace(UNTIL_NEW_OBJECT, min_probability=0.99)
+    )
     assert least(away(*z, 4)).status is Status.UNSURE
 
 

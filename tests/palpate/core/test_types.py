@@ -71,11 +71,11 @@ def test_an_answer_without_a_label_has_what_is_known_of_its_sweep():
     """Its latency counts from the frame or edge that completed the sweep."""
     about = {"lost": 3, "share": 0.5, "speed_mm_s": 30.0, "force_n": 1.5}
     sweep = Sweep(7, 1, 2, Status.SHORT, Frames.empty(PILLARS), complete_ns=40, **about)
-    v = Verdict.without_label(sweep, Status.GAP, "why", 100, "b")
+    v = Verdict.of(sweep, Status.GAP, 100, "b", detail="why")
     assert (v.sweep, v.time_ns, v.status, v.detail, v.bundle) == (7, 100, Status.GAP, "why", "b")
     assert {name: getattr(v, name) for name in about} == about
     assert (v.latency_ns, v.label, v.probability, v.margin, v.fused) == (60, "", 0, 0, 0)
     assert (len(v.scores), len(v.own), v.after) == (0, 0, 0)
     bare = Sweep(7, 1, 2, Status.SHORT, Frames.empty(PILLARS))
-    assert Verdict.without_label(bare, Status.SHORT, "", 100, "").latency_ns == 100
+    assert Verdict.of(bare, Status.SHORT, 100, "").latency_ns == 100
     assert (bare.lost, bare.object, bare.share) == (0, 0, 1)

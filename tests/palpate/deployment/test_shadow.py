@@ -18,6 +18,7 @@ from palpate.answer.taxels import Bridging
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core import statistics, storage, sweep_file, types
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.health import Health
 from palpate.core.types import Status, Sweep
@@ -38,9 +39,10 @@ class Side:
     def __init__(self, current: Bundle, candidate: Bundle, folder: Path, **how: Any) -> None:
         self.clock, self.folder = rig.VirtualClock(), folder
         self.tare = np.zeros((current.format.rows, current.format.cols))
-        self.current = Classifier(current, self.clock, **how)
+        rule = replace(UNTIL_NEW_OBJECT, **how)
+        self.current = Classifier(current, self.clock, rule)
         self.shadow = Shadow(
-            candidate, current, folder, self.clock, lambda b: Classifier(b, self.clock, **how)
+            candidate, current, folder, self.clock, lambda b: Classifier(b, self.clock, rule)
         )
 
     def judge(self, *sweeps: Sweep) -> None:

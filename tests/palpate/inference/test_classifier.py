@@ -20,6 +20,7 @@ from palpate.answer.early import Early
 from palpate.answer.objects import fuse, softmax
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier
@@ -31,8 +32,8 @@ WITH_EARLY = (*toy_bundle.OUTPUTS, "early")
 THIRD_ENROLLED = {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}
 
 
-def box(of: Bundle, *more: Any, **rule: Any) -> Classifier:
-    return Classifier(of, VirtualClock(), *more, **rule)
+def box(of: Bundle, **rule: Any) -> Classifier:
+    return Classifier(of, VirtualClock(), replace(UNTIL_NEW_OBJECT, **rule))
 
 
 @pytest.fixture
@@ -303,20 +304,20 @@ def displaced(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "hint"),
     [
-        ({"early": EARLY | {"least": []}}, "one for each step"),
+        ({"early": EARLY | {"least": []}}, "early.least "),
         *(
-            ({"early": EARLY | {"least": [0.5, n]}}, "numbers above 0")
+            ({"early": EARLY | {"least": [0.5, n]}}, "number above 0")
             for n in (0.0, -1, float("nan"), True, "0.5")
         ),
-        *(({"early": EARLY | {"agree": n}}, "from 1 on") for n in (0, 1.0, True, 4)),
+        *(({"early": EARLY | {"agree": n}}, f"agree {n} ") for n in (0, 1.0, True, 4)),
         *(
-            ({"thresholds": LIMITS | {name: value}}, f"thresholds.{name}")
+            ({"thresholds": LIMITS | {name: value}}, name)
             for name, value in (
                 *(("contact", -1.0), ("full_scale", 0.0), ("saturated", -0.1), ("saturated", 1.5)),
                 *(("dead_taxels", -1), ("dead_taxels", 4), ("unsure", -0.5)),
             )
         ),
-        ({"early": EARLY | {"least": 0.5}}, UNREAD),
+        ({"early": EARLY | {"least": 0.5}}, "early.least 0.5"),
         ({"early": {"least": [0.9]}}, "agree"),
         ({"early": {"agree": 1}}, "least"),
         ({"early": [0.9]}, UNREAD),
@@ -508,13 +509,13 @@ def test_at_the_limit_the_answer_is_final(toy):
 def test_sweeps_that_stand_alone_never_reach_the_limit(toy, object, fusion):
     """Without objects or fusion; a limit of one is final."""
     for limit, status in ((2, Status.UNSURE), (1, Status.UNDECIDED)):
-        it = box(toy, fusion, min_probability=0.85, max_sweeps=limit)
+        it = box(toy, fuse=fusion, min_probability=0.85, max_sweeps=limit)
         assert [it(borderline(object=object)).status for _ in range(3)] == [status] * 3
 
 
 def test_sure_is_the_bundles_where_none_is_given(toy):
     """0 stands for thresholds.unsure; without a limit nothing is ever undecided."""
-    assert box(toy).min_probability == toy_bundle.LIMITS.unsure
+    assert box(toy).settings.min_probability == toy_bundle.LIMITS.unsure
     assert box(toy)(borderline()).status is Status.OK
     it = box(toy, min_probability=1.1)
     assert {it(borderline(object=1)).status for _ in range(20)} == {Status.UNSURE}

@@ -21,7 +21,6 @@ from palpate.core.types import SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort
-from palpate.runtime import assembly
 from palpate.runtime.loop import Box
 from palpate.sim import devices, gpio, rig, script, skin
 from palpate.sweeps.capture import CaptureWriter, Playback
@@ -412,13 +411,13 @@ def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
     first = all_of(box)
     capture.close()
     play = Playback(tmp_path / "capture")
-    classifier = assembly.classifier(load_settings(SETS), model, play)
+    classifier = Classifier(model, play, load_settings(SETS).classifier)
     again, kept = [], []
     cutter = SweepCutter(FMT, SweepConfig(lead_ms=100))
     replayed = Box(
         *(play, play, cutter, classifier, play),
         early=EarlyExit(classifier),
-        port=StdoutPort("replay", play.commands),
+        port=StdoutPort(play.commands),
         observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
     )
     while not play.finished:

@@ -10,6 +10,7 @@ import pytest
 
 from palpate.answer.slide import SpeedRange
 from palpate.bundle.bundle import Bundle
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
@@ -40,8 +41,8 @@ def untrained(of: Bundle) -> Bundle:
     return replace(of, manifest=replace(of.manifest, speeds=None, disturbances=None))
 
 
-def box(of: Bundle, **more: Any) -> Classifier:
-    return Classifier(of, VirtualClock(), **more)
+def box(of: Bundle, **rule: Any) -> Classifier:
+    return Classifier(of, VirtualClock(), replace(UNTIL_NEW_OBJECT, **rule))
 
 
 def concluded(it: Classifier, sweep: Sweep, probabilities: np.ndarray) -> Verdict:

@@ -17,6 +17,7 @@ from palpate.answer.vibration import SlideLimits
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.types import Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
@@ -48,7 +49,7 @@ def resting(z1: float, z2: float, begin: int, end: int) -> Sweep:
 
 def test_a_rest_is_answered_no_slide(toy):
     """The detail names the tenths. The sweep is not fused, and the next one is answered."""
-    box = Classifier(toy, VirtualClock(), max_sweeps=3)
+    box = Classifier(toy, VirtualClock(), replace(UNTIL_NEW_OBJECT, max_sweeps=3))
     verdict = box(replace(resting(0, 0, 10, 14), object=1))
     assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
     assert re.search(r" 6 7 of 10, .* a ", verdict.detail)

@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
@@ -462,7 +463,7 @@ def test_outputs(need):
     """All low at first; then as set by `show` and `result`; low again once closed."""
     u = need("lines")
     o = u.output
-    with Lines(o, u.gpio, u.clock) as lines:
+    with closing(Lines(o, u.gpio, u.clock)) as lines:
         check_seen(u)
         lines.show(ready=True, busy=False, fault=False)
         check_seen(u, o.ready)
@@ -486,7 +487,7 @@ def test_outputs(need):
 def test_inputs_and_outputs_together(need):
     """The box has both at once: driving outputs causes no edge, and edges change no output."""
     u = need("lines")
-    with Watcher(u) as watcher, Lines(u.output, u.gpio, u.clock) as lines:
+    with Watcher(u) as watcher, closing(Lines(u.output, u.gpio, u.clock)) as lines:
         lines.show(ready=True, busy=False, fault=False)
         lines.result(1)
         assert watcher.seconds(0.05) == []
@@ -522,7 +523,7 @@ def sink_on() -> Iterator[Callable[..., SerialSink]]:
     made: list[SerialSink] = []
 
     def make(u: Backend, **settings: Any) -> SerialSink:
-        made.append(SerialSink(replace(u.serial, **settings), u.clock, u.name))
+        made.append(SerialSink(replace(u.serial, **settings), u.clock))
         made[-1].commands()
         return made[-1]
 

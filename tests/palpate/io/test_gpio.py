@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from itertools import accumulate, pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -488,7 +489,7 @@ def test_binding_of_libgpiod_1(module):
 def test_busy_line():
     """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
-    with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
+    with closing(GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio)):
         with pytest.raises(LineError, match=r"STOP.*16"):
             GpioTrigger(trigger_config(), gpio)
         assert [request.names for request in gpio.requests] == [{0: "STOP"}]
@@ -596,7 +597,7 @@ def test_close_drops_all(monkeypatch):
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: OUTPUTS})
     monkeypatch.setattr(SimRequest, "release", lambda request: gpio.requests.remove(request))
-    with Lines(output_config(), gpio, clock) as lines:
+    with closing(Lines(output_config(), gpio, clock)) as lines:
         lines.show(ready=True, busy=False, fault=False)
         lines.result(4)
         gpio.written.clear()

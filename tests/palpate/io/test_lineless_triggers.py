@@ -136,7 +136,7 @@ def test_the_space_bar_starts_and_stops(terminal):
     far, near = terminal
     said: list[str] = []
     clock = rig.VirtualClock(7)
-    with KeyTrigger(near, clock, said.append) as trigger:
+    with closing(KeyTrigger(near, clock, said.append)) as trigger:
         assert trigger.edges(8) == []
         os.write(far, b"x \x04")
         assert trigger.edges(8) == [Edge(START, 7)]
@@ -150,7 +150,7 @@ def test_the_space_bar_starts_and_stops(terminal):
 def test_after_an_answer_the_space_bar_starts(terminal):
     """A sweep that was answered `long` is over; a late answer to an older one changes nothing."""
     far, near = terminal
-    with KeyTrigger(near, rig.VirtualClock(), lambda line: None) as trigger:
+    with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
         watch = AnswerWatch(trigger)
         os.write(far, b" ")
         assert kinds(trigger.edges(1)) == [START]
@@ -170,7 +170,7 @@ def test_the_terminal_is_restored(terminal):
     before[3] |= termios.ECHO
     termios.tcsetattr(near, termios.TCSANOW, before)
     before = termios.tcgetattr(near)
-    with KeyTrigger(near, rig.VirtualClock(), lambda line: None):
+    with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)):
         inside = termios.tcgetattr(near)
         assert not inside[3] & (termios.ECHO | termios.ICANON)
         assert inside[3] & termios.ISIG

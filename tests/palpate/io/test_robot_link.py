@@ -160,14 +160,14 @@ def test_parse_never_raises_and_splits_anywhere(data, cuts):
 
 def sink_on(name: str, clock=None, **settings) -> SerialSink:
     """A sink on a port."""
-    return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock(), "sim")
+    return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock())
 
 
 def test_a_port_that_is_not_there_and_comes(tmp_path):
     """It is named with what to do, sentences wait in the queue, and it is opened later."""
     clock = rig.VirtualClock()
     sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
-    sink.send(verdict())
+    sink.say(result(verdict(), "sim"))
     assert "ttyUSB0" in sink.trouble
     assert "dialout" in sink.trouble
     with pseudo_terminal.pair() as (far, name):
@@ -315,7 +315,7 @@ def test_standard_output_that_takes_nothing(monkeypatch, error):
     """Sentences are dropped and counted, with the reason; they go on once it works again."""
     output = StandardOutput(error)
     monkeypatch.setattr(sys, "stdout", output)
-    port = StdoutPort("sim")
+    port = StdoutPort()
     port.say(b"1")
     port.say(b"2")
     assert port.dropped == 2
@@ -333,7 +333,7 @@ def test_a_pipe_that_nobody_reads_does_not_hold_the_loop(monkeypatch):
     reader, writer = os.pipe()
     with suppress(BrokenPipeError), os.fdopen(writer, "w") as stream:  # closing writes the rest
         monkeypatch.setattr(sys, "stdout", stream)
-        port = StdoutPort("sim")
+        port = StdoutPort()
         for _ in range(2000):
             port.say(b"x" * 100)
         assert port.dropped > 0

@@ -11,6 +11,7 @@ import pytest
 from palpate.answer.objects import EnrolledLabels, softmax
 from palpate.answer.unknown import ClassDistances
 from palpate.bundle.bundle import Bundle
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment, materials
@@ -116,7 +117,7 @@ def near_b(new: Bundle, p: float) -> tuple[float, float]:
 def test_sweeps_that_are_not_enough_are_enough_together(new, fusion, fused):
     """By the product; with votes each counts for its label."""
     z = near_b(new, 0.6)
-    it = Classifier(new, VirtualClock(), fusion)
+    it = Classifier(new, VirtualClock(), replace(UNTIL_NEW_OBJECT, fuse=fusion))
     verdicts = [it(toy_bundle.sweep(*z, number=n, object=1)) for n in (1, 2, 3)]
     alone = verdicts[0]
     assert alone.label == "b"

@@ -91,7 +91,7 @@ def test_lines_follow_the_sweep(rigged):
 def test_dead_process_is_not_ready(default_bundle):
     """After the process was killed the kernel releases its lines, and READY reads low."""
     simulated = quiet()
-    box = assembly.box(config.load(None), default_bundle, simulated, StdoutPort("sim"), ExitStack())
+    box = assembly.box(config.load(None), default_bundle, simulated, StdoutPort(), ExitStack())
     for _ in range(5):
         box.step()
     assert levels(simulated, READY) == [True]

@@ -17,6 +17,7 @@ from palpate.answer.early import Early
 from palpate.answer.taxels import Bridging, BrokenTaxels
 from palpate.bundle.bundle import Bundle
 from palpate.core import config
+from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.errors import FormatError
 from palpate.core.sweep_file import save, sidecar
 from palpate.core.types import Frames, Status, Sweep, Verdict
@@ -167,7 +168,9 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, d
 def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path):
     """Without them: scores are compared, no sentence."""
     model = early_toy(tmp_path / "bundle")
-    classifier = Classifier(model, rig.VirtualClock(), min_probability=0.97)
+    classifier = Classifier(
+        model, rig.VirtualClock(), replace(UNTIL_NEW_OBJECT, min_probability=0.97)
+    )
     whole = toy_bundle.sweep(2.5, 0.5, object=1)
     frames = replace(whole.frames, taxels=whole.frames.taxels[:10])
     frames = Frames(whole.frames.t_ns[:10], whole.frames.seq[:10], frames.taxels)
@@ -188,7 +191,8 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path):
 def test_objects_end_in_a_replay_as_they_did(tmp_path, toy, conflict):
     """NEW OBJECT once, then sweeps that contradict, a pause, and more than max_sweeps: the same
     verdicts. With any sweep missing, the sweeps that depended on it are compared by themselves."""
-    it = Classifier(toy, rig.VirtualClock(), max_sweeps=3, conflict=conflict, object_s=60.0)
+    rule = ClassifierConfig(max_sweeps=3, conflict=conflict)
+    it = Classifier(toy, rig.VirtualClock(), rule)
     folder, start_s, statuses = tmp_path / "kept", 0, []
     folder.mkdir()
     places = {"a": (0, 0), "b": (6, 0), " ": (0, 0), "?": (30, 30)}

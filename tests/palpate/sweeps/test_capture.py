@@ -15,9 +15,9 @@ from palpate.core.config import SweepConfig
 from palpate.core.errors import ConfigError, FormatError
 from palpate.core.sweep_file import load, save
 from palpate.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, Verdict
+from palpate.inference.classifier import Classifier
 from palpate.io import packets
 from palpate.io.robot_link import StdoutPort
-from palpate.runtime import assembly
 from palpate.runtime.loop import Box
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
@@ -33,10 +33,10 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     play = Playback(path)
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
-    classifier = assembly.classifier(load_settings(), model, play)
+    classifier = Classifier(model, play, load_settings().classifier)
     parts = play, play, SweepCutter(play.format, SweepConfig()), classifier, play
     observers = [OnSweep(lambda sweep, verdict: sweeps.append(sweep))]
-    box = Box(*parts, port=StdoutPort("replay", play.commands), observers=observers)
+    box = Box(*parts, port=StdoutPort(play.commands), observers=observers)
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps

@@ -10,6 +10,7 @@ import pytest
 from palpate.answer.taxels import bridged
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
+from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import BundleError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
@@ -167,7 +168,7 @@ def test_the_packaged_bundle_bridges_what_its_manifest_says():
     """None is refused, one of twelve loses its label."""
     packaged = bundle.load(bundle.DEFAULT)
     assert packaged.manifest.bridging
-    box = Classifier(packaged, SystemClock(), strangers="loose")
+    box = Classifier(packaged, SystemClock(), replace(UNTIL_NEW_OBJECT, strangers="loose"))
     test = EvaluationSweeps.of(sets.load("sim:T-REAL/level-blind:31:1"), 12)
     for place in range(16):
         mask = (np.arange(16) == place).reshape(1, 1, 4, 4)

@@ -10,17 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, prod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from palpate.bundle.manifest import MOST_BYTES, Manifest
 from palpate.bundle.onnx_check import operators, reader
 from palpate.bundle.onnx_check.operators import INDEX, KINDS, OPERATORS, SAME, need
 from palpate.bundle.onnx_check.reader import Message
 from palpate.core.errors import BundleError
-
-if TYPE_CHECKING:
-    from palpate.bundle.manifest import Manifest
 
 VERSIONS = {"": range(17, 19), "ai.onnx.ml": range(3, 4), "com.microsoft": range(1, 2)}
 """Versions of the operators of each domain: the version that palpate-train writes, and the next,
@@ -29,13 +27,10 @@ FORMATS = range(8, 10)
 """Versions of the file (IR version), likewise."""
 NOTES = ("onnx.infer", "onnx.quant.pre_process")
 """Metadata that onnxruntime's quantization writes into a model."""
-MOST_FILE = 64 << 20
-"""Bytes of the file. Our largest, the paper's CNN in int8, has 16 MB."""
+MOST_FILE = MOST_TENSOR = MOST_BYTES
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
 """Largest numbers of nodes and constants: three times those of MiniRocket, our largest graph.
 onnxruntime takes a kilobyte or two for each."""
-MOST_TENSOR = 64 << 20
-"""Bytes of one constant, and of the input and each output."""
 MOST_RANK = 8
 """Most dimensions of a tensor; those of our models have up to five."""
 MOST_INT8 = 64
