@@ -41,10 +41,7 @@ def run(args: argparse.Namespace) -> int:
     settings, stopped = load_settings(args), StopFlag()
     with ExitStack() as stack:
         devices, format = open_skin(args, settings)
-        # a person at a terminal reads the log; sentences are for a robot, or for a program that
-        # reads the output
-        sentences = settings.serial.port or not sys.stdout.isatty()
-        port = assembly.port(settings, devices) if sentences else None
+        port = assembly.port(settings, devices, terminal=False)
         folder, disk = args.out or settings.kept("sweeps"), DiskThread()
         recording = RecordingSession(
             folder, format, labels, devices.clock, _sentences(port), args.target, disk

@@ -3,31 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_type_hints
 
 from palpate.core import sentences
 from palpate.core.errors import FormatError
 from palpate.core.status import WORDS, Status
 
-_ANSWER: tuple[Callable[[str], Any], ...] = (
-    *(int, float, Status, str, float, float),
-    *(int, int, float, str, str, float),
-)
-_STATE: tuple[Callable[[str], Any], ...] = (
-    *(float, str, "1".__eq__),
-    *(int, int, int, int, int, int, str, str),
-)
-"""Types of the first fields of RES and of STA."""
+ANSWER_FIELDS, STATE_FIELDS = 12, 11
+"""Fields that each RES and each STA has; others follow."""
 
 
-def _read(
-    names: Sequence[str], kinds: Sequence[Callable[[str], Any]], fields: Sequence[str]
-) -> dict[str, Any]:
-    """The first fields by name. Raises ValueError if they are too few or of another type."""
-    each = zip(kinds, fields[: len(kinds)], strict=True)
-    return dict(zip(names, (kind(text) for kind, text in each), strict=False))
+def _first(kind: type, fields: Sequence[str], number: int) -> dict[str, Any]:
+    """The first fields of a sentence by name, of the types in `kind`. Raises ValueError if they are
+    too few or of another type."""
+    hints: dict[str, Any] = get_type_hints(kind) | {"sweeping": "1".__eq__}
+    names = list(hints)[:number]
+    return {n: hints[n](text) for n, text in zip(names, fields[:number], strict=True)}
 
 
 def _malformed(kind: str, fields: Sequence[str], why: object) -> FormatError:
@@ -70,7 +63,7 @@ class Answer:
     def of(cls, fields: Sequence[str]) -> Answer:
         """The answer in the fields of a RES sentence. Raises FormatError if they are invalid."""
         try:
-            first = _read(cls.__slots__, _ANSWER, fields)
+            first = _first(cls, fields, ANSWER_FIELDS)
             return cls(
                 **first,
                 detail=",".join(fields[12:13]),
@@ -147,7 +140,7 @@ class BoxState:
         """The state in the fields of STA or of the answer to STATE. Raises FormatError if they are
         invalid."""
         try:
-            first = _read(cls.__slots__, _STATE, fields)
+            first = _first(cls, fields, STATE_FIELDS)
             return cls(**first, degraded=",".join(fields[18:19]))
         except ValueError as e:
             raise _malformed("STA", fields, e) from e

@@ -25,7 +25,7 @@ _hints: Callable[[Any], dict[str, Any]] = cache(partial(get_type_hints, include_
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """Bounds of a number, or of the length of a tuple, as in Annotated[float, Within(0, 1)]."""
+    """Bounds of a number, or of the length of a tuple or text: Annotated[float, Within(0, 1)]."""
 
     least: float
     most: float
@@ -148,7 +148,8 @@ def _words(hint: Any) -> str:
     """The allowed values of a type, for a person."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind is Annotated:
-        return f"{_words(parts[0])}{', its length' * (get_origin(parts[0]) is tuple)} {parts[1]}"
+        sized = get_origin(parts[0]) is tuple or parts[0] is str
+        return f"{_words(parts[0])}{', its length' * sized} {parts[1]}"
     if kind in (UnionType, Union):
         return " or ".join(map(_words, parts))
     if kind is tuple:
@@ -179,7 +180,7 @@ def _fits(value: Any, hint: Any) -> bool:
     """Whether `value` from a file is allowed for a field of type `hint`."""
     if get_origin(hint) is Annotated:
         base, bounds = get_args(hint)
-        size = len(value) if isinstance(value, tuple) else value
+        size = len(value) if isinstance(value, tuple | str) else value
         return _fits(value, base) and bool(bounds.least <= size <= bounds.most)
     if get_origin(hint) in (UnionType, Union):
         return any(_fits(value, part) for part in get_args(hint))

@@ -34,7 +34,6 @@ NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 """Valid names of profiles, and so of their files."""
 _GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
 _USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
-_TURNS = ("transpose", "flip-rows", "flip-columns")
 _NEEDED = ("about", "source", "codec")
 
 
@@ -49,11 +48,11 @@ def _hexadecimal(most: int) -> Any:
     return custom(b"", f'up to {most} bytes in hexadecimal, such as "aa 55"', read)
 
 
-def _several(allowed: str, fits: Any, default: tuple[Any, ...] = ()) -> Any:
+def _several(allowed: str, fits: Any) -> Any:
     def read(value: Any) -> tuple[Any, ...] | None:
         return tuple(value) if isinstance(value, list) and all(map(fits, value)) else None
 
-    return custom(default, allowed, read)
+    return custom((), allowed, read)
 
 
 def _is_usb_id(value: Any) -> bool:
@@ -77,14 +76,6 @@ def _binary(value: str) -> bool:
         return False
 
 
-def _is_channel(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 64
-
-
-def _is_column(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 4096
-
-
 def _checksum() -> Any:
     def read(value: Any) -> str | None:
         fits = isinstance(value, str) and (not value or checksums.parsed(value))
@@ -100,60 +91,15 @@ def _number() -> Any:
     return custom("uint8", f"one of {types}, {several}", wire_numbers.known)
 
 
-def _text(most: int) -> Any:
-    def read(value: Any) -> str | None:
-        fits = isinstance(value, str) and len(value) <= most and value.isprintable()
-        return value if fits else None
-
-    return custom("", f"up to {most} printable characters", read)
-
-
-def _is_rate(value: Any) -> bool:
-    return type(value) in (int, float) and 0.1 <= value <= 100_000
-
-
 @dataclass(frozen=True, slots=True)
 class SkinProfile:
-    """The bytes that a skin sends. Raises ConfigError for values that contradict each other.
-
-    about: a line of description. source: where the facts are from. measured: who has compared them
-    with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
-    stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
-    skin, which takes tare_s. poll: requests of a frame, sent rate_hz times a second, for skins that
-    answer when asked. codec: how frames are recognized. unit: of its numbers, "" for raw
-    counts.
-
-    "fixed": marker, trailer: bytes before and after a frame. skip_before, skip_after: ignored bytes
-    before and after the numbers. sequence: type of a frame count, sequence_at: its first byte,
-    counted from the end of the marker. checksum: see `checksums.parsed`; it stands behind the
-    bytes of skip_after, checksum_from: the first byte that it covers, counted from the beginning of
-    the marker; it covers all bytes up to itself. byte_order: of a number on the wire;
-    sequence_order, checksum_order: of these, "" for byte_order.
-
-    "segments": the keys of "fixed" without those of a count. A frame has one part or several.
-    length: type of a part's length, length_at: its first byte, counted from the end of the marker;
-    length_of: its unit. segment: numbers of a part without a length, 0 for a whole frame. index:
-    type of the number of a part, which rises within a frame, index_at: its first byte. zeros: after
-    a 0 comes the number of zeros that it stands for.
-
-    "modbus": unit_id, function (3 or 4), register: the first that holds numbers, big-endian.
-
-    "text": lines: content of a line. index: the beginning of a line, with # in the place of its
-    number, or of its row and its column. skip_columns: numbers of a line that are ignored, counted
-    from 0. prefix: the beginning of all lines of numbers; others are passed over. around: the
-    characters of a line without its numbers, separators and brackets. decimal: the decimal mark.
-    line_end: the character that ends a line.
-
-    number: type of a number on the wire. values: numbers of one taxel there. take: indices of those
-    that are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on
-    the wire. orientation: turns after which the rows lie along the direction of sliding. rate_hz:
-    frames per second; rates_hz: those that `start` can set with {rate} or {period_ms}.
-    """
+    """The bytes that a skin sends; the template matrix.toml explains each field. rows, cols: before
+    the turns of `orientation`. Raises ConfigError for values that contradict each other."""
 
     about: str = ""
     source: str = ""
     measured: str = ""
-    unit: str = _text(16)
+    unit: Annotated[str, Within(0, 16)] = ""
     codec: Literal[
         "palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf", "segments", "modbus"
     ] = "palpate"
@@ -176,7 +122,7 @@ class SkinProfile:
     checksum: str = _checksum()
     checksum_from: Annotated[int, Within(0, 4096)] = 0
     checksum_order: Literal["", "little", "big"] = ""
-    index: str = _text(64)
+    index: Annotated[str, Within(0, 64)] = ""
     index_at: Annotated[int, Within(0, 4096)] = 0
     length: Literal["", "uint8", "uint16", "uint32"] = ""
     length_at: Annotated[int, Within(0, 4096)] = 0
@@ -187,9 +133,9 @@ class SkinProfile:
     function: Literal[3, 4] = 3
     register: Annotated[int, Within(0, 65535)] = 0
     lines: Literal["rows", "frames", "taxels"] = "rows"
-    skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
-    prefix: str = _text(64)
-    around: str = _text(16384)
+    skip_columns: tuple[Annotated[int, Within(0, 4095)], ...] = ()
+    prefix: Annotated[str, Within(0, 64)] = ""
+    around: Annotated[str, Within(0, 16384)] = ""
     decimal: Literal[".", ","] = "."
     line_end: Literal["\n", "\r"] = "\n"
     number: str = _number()
@@ -197,12 +143,10 @@ class SkinProfile:
     rows: Annotated[int, Within(1, 255)] = 4
     cols: Annotated[int, Within(1, 255)] = 4
     values: Annotated[int, Within(1, 64)] = 1
-    take: tuple[int, ...] = _several(
-        "positions among the values of a taxel such as [1, 2, 3]", _is_channel, (0,)
-    )
-    orientation: tuple[str, ...] = _several(f"some of {', '.join(_TURNS)}", _TURNS.__contains__)
+    take: tuple[Annotated[int, Within(0, 63)], ...] = (0,)
+    orientation: tuple[Literal["transpose", "flip-rows", "flip-columns"], ...] = ()
     rate_hz: Annotated[float, Within(0.1, 100_000.0)] = 100.0
-    rates_hz: tuple[float, ...] = _several("rates such as [100, 250]", _is_rate)
+    rates_hz: tuple[Annotated[float, Within(0.1, 100_000.0)], ...] = ()
 
     def __post_init__(self) -> None:
         if why := _contradiction(self):

@@ -4,7 +4,6 @@ and with a page then tries the bundle, until it is taught again or the person is
 from __future__ import annotations
 
 import getpass
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from palpate.core.names import TypedNames
 from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import CommandHandler, Reply
 from palpate.core.types import SweepFormat
-from palpate.io.robot_link import Command, Port
+from palpate.io.robot_link import Command
 from palpate.io.verdict_lines import check_bits
 from palpate.learn import install, materials
 from palpate.learn.enrolment import slide_check
@@ -115,11 +114,6 @@ class TeachingProgram:
         self._done = True
         return []
 
-    def port(self) -> Port | None:
-        """The line to the robot; none for a person at a terminal."""
-        sentences = self.settings.serial.port or not sys.stdout.isatty()
-        return assembly.port(self.settings, self.devices) if sentences else None
-
     def by_robot(self, commands: Mapping[str, CommandHandler]) -> dict[str, CommandHandler]:
         """The commands that the serial line carries, if the settings allow them to a robot."""
         allowed = self.settings.teach.serial
@@ -143,7 +137,8 @@ class RecordingPhase(Phase):
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
         self._program, lesson, devices = program, program.lesson, program.devices
         settings, again, pages = program.settings, program.again, program.pages
-        port, disk = program.port(), DiskThread()
+        port = assembly.port(settings, devices, terminal=False)
+        disk = DiskThread()
         say = port.say if port else lambda line: None
         labels = Labels(again, lesson.position, lesson.session)
         to = settings.kept("sweeps"), program.format, labels
@@ -230,6 +225,7 @@ class TryingPhase(Phase):
         for one in trial:
             one.disk = disk
         self._bundle, m = choice.bundle, choice.bundle.manifest
+        port = assembly.port(settings, program.devices, terminal=False)
         facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
         again = {"TEACH": self._teach_again}
         self.orders = {**again, "DONE": program.finish}
@@ -237,7 +233,7 @@ class TryingPhase(Phase):
         source = program.devices.source
         shown = *status(settings, facts), *feed(settings, m.format, source, known, facts)
         self.box = assembly.box(
-            *(settings, choice.bundle, program.devices, program.port(), stack),
+            *(settings, choice.bundle, program.devices, port, stack),
             observers=[disk, Notifier(SystemClock()), *trial, *shown, *program.pages],
             commands=program.by_robot(again),
             ordered=bool(program.pages),

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core.clock import Clock, SystemClock
+from palpate.core.clock import SystemClock
 from palpate.core.config import TeachConfig
 from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.health import Health
@@ -49,7 +49,7 @@ class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
     learn: makes the command of USE. say: called with TCH
-    sentences. clock: the real clock, because processes run in real time. codes: number of codes of
+    sentences. codes: number of codes of
     the class bits, 0 without class bits. base: labels of the delivered bundle into which new
     materials are taught, () without one. trained: those of them that it was trained on. It must
     come after `recording` among the observers.
@@ -61,7 +61,6 @@ class TeachingSession(Observer):
         settings: TeachConfig,
         learn: Learn,
         say: Callable[[bytes], None],
-        clock: Clock | None = None,
         codes: int = 0,
         base: tuple[str, ...] = (),
         trained: tuple[str, ...] = (),
@@ -69,7 +68,7 @@ class TeachingSession(Observer):
         self._recording, self._settings = recording, settings
         self._codes, self._base, self._trained = codes, base, trained
         self._fewest = 1 if base else FEWEST_TAUGHT
-        self._learn, self._clock, self._say = learn, clock or SystemClock(), say
+        self._learn, self._clock, self._say = learn, SystemClock(), say
         self._place = recording.about()["position"] or "1"  # of the first sweeps
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
@@ -226,8 +227,10 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
     return found
 
 
-def port(settings: Config, devices: Devices) -> Port | None:
-    """The serial line, or standard output; none in the journal, which people read."""
+def port(settings: Config, devices: Devices, *, terminal: bool = True) -> Port | None:
+    """The serial line, or standard output; none in the journal, which people read. terminal: also
+    if standard output is one; a person there reads the log."""
     if settings.serial.port:
         return SerialSink(settings.serial, devices.clock)
-    return None if in_journal() else StdoutPort()
+    read = in_journal() or not (terminal or not sys.stdout.isatty())
+    return None if read else StdoutPort()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from palpate.core.config import SweepConfig, TriggerConfig
 from palpate.core.errors import ConfigError, FormatError
 from palpate.core.sweep_set import SweepSet, load_file
 from palpate.core.types import SweepFormat
@@ -29,13 +30,12 @@ PAUSE_S = 0.1, 0.14
 so that edges come anywhere within packets."""
 PAUSE_FRAMES = 12
 """Least number of frames without contact, so that a slow skin is seen unloaded, too."""
-SLIDE_S, REST_S = 3.0, 0.1
+SLIDE_S, REST_S = TriggerConfig().sweep_s, 0.1
 """Duration of the slide (paper, sec. II.B), and of the rest before and after it."""
 FOLLOWED_S = 8.0
 """Duration of a slide that ends with the command STOP; it is repeated if STOP comes later."""
-LEAD_S = 0.5
-"""Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and
-last frame are repeated for this time."""
+LEAD_S = SweepConfig().lead_ms / 1000
+"""Time from an edge to a recorded window, for which its first and last frame are repeated."""
 LIFTED_SET_S = 0.4
 """Time for which the finger is lifted before a sweep of a set. A set does not record the unloaded
 skin, so all counts are 0."""
@@ -138,24 +138,14 @@ def tubes(
     """
     materials = (world.tube(only).name,) if only else skin.MATERIALS
     rng, places = np.random.default_rng(seed), places or skin.placements("T-LAB", seed)
-    return _tubes(rng, sweeps, places, world, seen, materials, slide_s)
 
+    def spots() -> Iterator[tuple[str, skin.Placement]]:
+        for place in itertools.cycle(places):
+            for label in rng.permutation(materials)[::-1]:
+                yield str(label), place
 
-def _tubes(
-    rng: Generator,
-    sweeps: int | None,
-    places: Sequence[skin.Placement],
-    world: skin.World,
-    seen: SeenTubes,
-    materials: Sequence[str],
-    slide_s: float,
-) -> Iterator[Act]:
-    rounds = itertools.cycle(places)
-    tubes_left: list[str] = []
-    for _ in itertools.count() if sweeps is None else range(sweeps):
-        if not tubes_left:
-            tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
-        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s)
+    some = itertools.islice(spots(), sweeps)
+    return (slide(label, place, rng, world, seen, slide_s) for label, place in some)
 
 
 def slide(

@@ -51,12 +51,10 @@ class RecordKind(IntEnum):
     STATE = 1
     EDGES = 2
     COMMAND = 3
-    SLIDES = 4
 
 
-_EDGES = {RecordKind.EDGES: struct.Struct("<QB"), RecordKind.SLIDES: struct.Struct("<QBdd")}
-"""Layout of an edge: time and kind; in SLIDES also speed in mm/s and force in N, 0 if START had
-none. Edges without them are written as EDGES."""
+_EDGE = struct.Struct("<QBdd")
+"""Layout of an edge: time, kind, speed in mm/s and force in N, 0 if it has none."""
 
 
 class CaptureWriter(Observer):
@@ -94,9 +92,7 @@ class CaptureWriter(Observer):
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Write edges that the trigger returned at `t_ns`."""
         rows = [(e.t_ns, _KINDS.index(e.kind), e.speed_mm_s or 0, e.force_n or 0) for e in edges]
-        kind = RecordKind.SLIDES if any(row[2:] != (0, 0) for row in rows) else RecordKind.EDGES
-        width = 4 if kind == RecordKind.SLIDES else 2
-        self._write(kind, t_ns, b"".join(_EDGES[kind].pack(*row[:width]) for row in rows))
+        self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(*row) for row in rows))
 
     def command(self, t_ns: int, line: str) -> None:
         """Write a command that was executed, as a sentence."""
@@ -207,21 +203,20 @@ class Playback:
 
     def edges(self, now_ns: int) -> list[Edge]:
         """Trigger: the edges that the box received at this time."""
-        edges = []
-        while self._records and self._records[0][0] in _EDGES and self._records[0][1] <= now_ns:
-            kind, _, body = self._records.popleft()
-            edges += [
-                Edge(_KINDS[k], t, *(value or None for value in slide))
-                for t, k, *slide in _EDGES[kind].iter_unpack(body)
-            ]
-        return edges
+        return [
+            Edge(_KINDS[k], t, *(value or None for value in slide))
+            for body in self._due(RecordKind.EDGES, now_ns)
+            for t, k, *slide in _EDGE.iter_unpack(body)
+        ]
 
     def commands(self) -> list[Command]:
         """Port: the commands that were executed at this time."""
-        found, due = [], RecordKind.COMMAND
-        while self._records and self._records[0][0] == due and self._records[0][1] <= self._now_ns:
-            found.append(_command(self._records.popleft()[2]))
-        return found
+        return [_command(body) for body in self._due(RecordKind.COMMAND, self._now_ns)]
+
+    def _due(self, kind: RecordKind, now_ns: int) -> Iterator[bytes]:
+        """The contents of the next records, as far as they are of this kind and time."""
+        while self._records and self._records[0][0] == kind and self._records[0][1] <= now_ns:
+            yield self._records.popleft()[2]
 
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
@@ -240,10 +235,10 @@ def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int
 
 def _written(kind: int, t_ns: int, body: bytes) -> bool:
     """Whether this record can come from CaptureWriter."""
-    if layout := _EDGES.get(RecordKind(kind)):
-        return not len(body) % layout.size and all(
+    if kind == RecordKind.EDGES:
+        return not len(body) % _EDGE.size and all(
             k < len(_KINDS) and t < _MOST_NS and all(0 <= value < math.inf for value in slide)
-            for t, k, *slide in layout.iter_unpack(body)
+            for t, k, *slide in _EDGE.iter_unpack(body)
         )
     if kind == RecordKind.COMMAND:
         return not _command(body).error
