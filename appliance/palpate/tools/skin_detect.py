@@ -85,20 +85,95 @@ def described(format: SweepFormat) -> str:
     return f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
 
 
-def detect(
-    ports: Iterable[PortInfo],
-    profiles: Mapping[str, SkinProfile],
-    open_port: OpenPort,
-    clock: Clock,
-    *,
-    write: bool = False,
-) -> Iterator[PortFinding]:
-    """The skins on the ports. write: also ask, and send start commands."""
-    for port in ports:
-        try:
-            yield from _on_port(port, profiles, open_port, clock, write)
-        except SensorError as e:
-            yield PortFinding(port, "", str(e))
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """Listens at serial ports. open_port: opens one at a speed; raises SensorError."""
+
+    open_port: OpenPort
+    clock: Clock
+
+    def detect(
+        self, ports: Iterable[PortInfo], profiles: Mapping[str, SkinProfile], *, write: bool = False
+    ) -> Iterator[PortFinding]:
+        """The skins on the ports. write: also ask, and send start commands."""
+        for port in ports:
+            try:
+                yield self._on_port(port, profiles, write)
+            except SensorError as e:
+                yield PortFinding(port, "", str(e))
+
+    def _on_port(
+        self, port: PortInfo, profiles: Mapping[str, SkinProfile], write: bool
+    ) -> PortFinding:
+        by_ids = [n for n, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
+        known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
+        others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
+        heard: dict[int, HeardBytes] = {}
+        # profiles with the port's ids first; each speed once, for all profiles that use it
+        first = sorted(others, key=lambda name: name not in by_ids)
+        for baud in dict.fromkeys(others[name].baud for name in first):
+            these = {name: p for name, p in others.items() if p.baud == baud}
+            asked = [p for p in these.values() if write and (p.start or requests(p))]
+            for starter in (None, *asked):
+                heard[baud] = self.listen(port.path, baud, starter)
+                if fitting := [n for n in these if fits(these[n], heard[baud])]:
+                    found = _settings(port, fitting, these, heard[baud])
+                    return PortFinding(port, fitting[0], known + found)
+        for name, p in others.items():
+            if taxels := other_grid(p, heard[p.baud]):
+                return PortFinding(port, name, known + _another_grid(port, name, taxels))
+        if write and (who := self._asked(port.path)):
+            told = f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
+            return PortFinding(port, DEFAULT, told)
+        proposal, sample = self.propose(port.path, heard)
+        nothing = _nothing(sample, others, write, bool(proposal))
+        return PortFinding(port, "", known + nothing, proposal)
+
+    def propose(
+        self,
+        path: str,
+        heard: dict[int, HeardBytes],
+        grid: tuple[int, int] | None = None,
+        bauds: Iterable[int] = BAUDS,
+    ) -> tuple[str, HeardBytes]:
+        """The text of a profile for the lines of numbers at a port, or "", and all bytes heard
+        there. heard: by speed so far; `bauds` follow until one gives text. Raises SensorError."""
+        for baud in dict.fromkeys((*heard, *bauds)):
+            if baud not in heard:
+                if heard and not any(one.reads for one in heard.values()):
+                    break  # silent at any speed
+                heard[baud] = self.listen(path, baud)
+            if heard[baud].reads and skin_text.is_text(heard[baud].data):
+                return _proposed(baud, heard[baud], grid), heard[baud]
+        return "", max(heard.values(), key=lambda one: len(one.data))
+
+    def listen(
+        self, path: str, baud: int, starter: SkinProfile | None = None, seconds: float = LISTEN_S
+    ) -> HeardBytes:
+        """The bytes of a port. starter: its commands and requests are written. Raises
+        SensorError."""
+        port, now_ns = self.open_port(path, baud), self.clock.now_ns
+        reads: list[tuple[bytes, int]] = []
+        link = started(port, starter, starter.rate_hz, self.clock) if starter else port
+        with closing(link):
+            until_ns = now_ns() + round(seconds * 1e9)
+            while (left_ns := until_ns - now_ns()) > 0:
+                if data := link.read(1 << 16, max(1, left_ns // 1_000_000)):
+                    if not reads:  # a board may boot first
+                        until_ns = now_ns() + round(seconds * 1e9)
+                    reads.append((data, now_ns()))
+        return HeardBytes(reads)
+
+    def _asked(self, path: str) -> str:
+        """The answer of a board of PROTOCOL.md, "" if there is none."""
+        with closing(self.open_port(path, SkinProfile().baud)) as port:
+            try:
+                port.write(bytes([packets.Request.IDENTITY]))
+                reply = reply_to(packets.Request.IDENTITY, port.read, self.clock)
+                who = packets.unpack_identity(reply)
+            except (SensorError, FormatError):
+                return ""
+        return f"board {who.board} {who.serial} speaks PROTOCOL.md, version {who.protocol}"
 
 
 def _another_grid(port: PortInfo, name: str, taxels: int) -> str:
@@ -107,85 +182,6 @@ def _another_grid(port: PortInfo, name: str, taxels: int) -> str:
         f' skin.profile = "{name}", skin.port = "{port.path}"; if it is another skin, copy'
         " matrix.toml and describe it there"
     )
-
-
-def _on_port(
-    port: PortInfo,
-    profiles: Mapping[str, SkinProfile],
-    open_port: OpenPort,
-    clock: Clock,
-    write: bool,
-) -> Iterator[PortFinding]:
-    by_ids = [name for name, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
-    known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
-    others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
-    heard: dict[int, HeardBytes] = {}
-    # profiles with the port's ids first; each speed once, for all profiles that use it
-    for baud in dict.fromkeys(
-        others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)
-    ):
-        these = {name: p for name, p in others.items() if p.baud == baud}
-        for starter in [
-            None,
-            *(n for n in these if write and (these[n].start or requests(these[n]))),
-        ]:
-            by = these[starter] if starter else None
-            heard[baud] = listen(port.path, baud, by, open_port, clock, LISTEN_S)
-            if fitting := [n for n in these if fits(these[n], heard[baud])]:
-                found = _settings(port, fitting, these, heard[baud])
-                yield PortFinding(port, fitting[0], known + found)
-                return
-    for name, p in others.items():
-        if taxels := other_grid(p, heard[p.baud]):
-            yield PortFinding(port, name, known + _another_grid(port, name, taxels))
-            return
-    if write and (who := _asked(port.path, open_port, clock)):
-        told = f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
-        yield PortFinding(port, DEFAULT, told)
-        return
-    proposal, sample = propose(port.path, heard, open_port, clock)
-    yield PortFinding(port, "", known + _nothing(sample, others, write, bool(proposal)), proposal)
-
-
-def propose(
-    path: str,
-    heard: dict[int, HeardBytes],
-    open_port: OpenPort,
-    clock: Clock,
-    grid: tuple[int, int] | None = None,
-    bauds: Iterable[int] = BAUDS,
-) -> tuple[str, HeardBytes]:
-    """The text of a profile for the lines of numbers at a port, or "", and all bytes heard there.
-    heard: by speed so far; `bauds` follow until one gives text. Raises SensorError."""
-    for baud in dict.fromkeys((*heard, *bauds)):
-        if baud not in heard:
-            if heard and not any(one.reads for one in heard.values()):
-                break  # silent at any speed
-            heard[baud] = listen(path, baud, None, open_port, clock, LISTEN_S)
-        if heard[baud].reads and skin_text.is_text(heard[baud].data):
-            return _proposed(baud, heard[baud], grid), heard[baud]
-    return "", max(heard.values(), key=lambda one: len(one.data))
-
-
-def listen(
-    path: str,
-    baud: int,
-    starter: SkinProfile | None,
-    open_port: OpenPort,
-    clock: Clock,
-    seconds: float,
-) -> HeardBytes:
-    """The bytes of a port. starter: its commands and requests are written. Raises SensorError."""
-    port = open_port(path, baud)
-    reads: list[tuple[bytes, int]] = []
-    with closing(started(port, starter, starter.rate_hz, clock) if starter else port) as link:
-        until_ns = clock.now_ns() + round(seconds * 1e9)
-        while (left_ns := until_ns - clock.now_ns()) > 0:
-            if data := link.read(1 << 16, max(1, left_ns // 1_000_000)):
-                if not reads:  # a board may boot first
-                    until_ns = clock.now_ns() + round(seconds * 1e9)
-                reads.append((data, clock.now_ns()))
-    return HeardBytes(reads)
 
 
 def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
@@ -220,19 +216,6 @@ def _settings(
     more = f" (and as {', '.join(fitting[1:])})" if len(fitting) > 1 else ""
     format = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
     return f"sends {described(format)}{more}; set {', '.join(sets)}"
-
-
-def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
-    """The answer of a board of PROTOCOL.md, "" if there is none."""
-    port = open_port(path, SkinProfile().baud)
-    try:
-        port.write(bytes([packets.Request.IDENTITY]))
-        who = packets.unpack_identity(reply_to(packets.Request.IDENTITY, port.read, clock))
-        return f"board {who.board} {who.serial} speaks PROTOCOL.md, version {who.protocol}"
-    except (SensorError, FormatError):
-        return ""
-    finally:
-        port.close()
 
 
 def _proposed(baud: int, sample: HeardBytes, grid: tuple[int, int] | None) -> str:
