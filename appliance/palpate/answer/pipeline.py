@@ -66,7 +66,7 @@ class Slide:
 
 @dataclass(slots=True, eq=False)
 class Context:
-    """A sweep, and what the stages have found so far.
+    """A sweep, with the findings of the stages so far.
 
     taxels: raw counts [T, R, C] or [T, R, C, A], as the network gets them: broken taxels bridged,
     without hum. tare: raw counts [R, C] or [R, C, A] of the unloaded skin. whole: whether all

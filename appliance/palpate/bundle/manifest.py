@@ -140,7 +140,7 @@ def version(text: object) -> tuple[int, ...]:
 
 
 def _faults(m: Manifest) -> Iterator[str]:
-    """What is wrong with the values of a manifest."""
+    """The faults of a manifest."""
     if type(m.schema) is not int or m.schema != SCHEMA:
         yield f"schema {m.schema} is unknown, and this version reads {SCHEMA}: update one of them"
     if m.input not in INPUTS:

@@ -280,7 +280,7 @@ class Classifier(Observer):
         return self.verdict(self.judged(sweep, self._stages))
 
     def judged(self, sweep: Sweep, stages: Sequence[Stage]) -> Context:
-        """What the stages find in one sweep; nothing if its status is not ok."""
+        """The findings of the stages in one sweep; none if its status is not ok."""
         whole = len(sweep.frames) == self.bundle.format.window
         context = Context(sweep, sweep.frames.taxels, self.tare, whole, sweep.status)
         return run(stages, context) if sweep.status is Status.OK else context

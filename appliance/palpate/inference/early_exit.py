@@ -51,5 +51,5 @@ class EarlyExit:
         return self._classifier.verdict(context) if context.status is Status.OK else None
 
     def judged(self, sweep: Sweep) -> Context:
-        """What the stages find in a sweep with share < 1."""
+        """The findings of the stages in a sweep with share < 1."""
         return self._classifier.unfinished(sweep, self._stages)
