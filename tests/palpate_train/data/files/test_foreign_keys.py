@@ -13,9 +13,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data import lerobot, raw_files
 from palpate_train.data.files.table import ReadPlan
 from palpate_train.data.import_plan import ImportPlan
-from tests.palpate_train.data.files.test_octave import written
-from tests.palpate_train.data.files.test_tekscan import HEAD, movie
-from tests.palpate_train.data.test_lerobot import data_set
+from tests.factories.foreign_files import HEAD, lerobot_set, movie, octave
 
 SKIN = np.arange(40 * 4).reshape(40, 4)
 SENSORS = [{"name": name, "units": "N"} for name in "abcd"]
@@ -114,7 +112,7 @@ def episodes(folder: Path) -> list[str]:
 @pytest.mark.parametrize("value", ["abc", [0, 3], [None], [2.5, 3], [[2], 3]], ids=str)
 def test_a_feature_of_lerobot_without_a_shape(tmp_path: Path, value: Any):
     """The feature of the skin has to state it; an entry that is no feature is passed over."""
-    info = data_set(tmp_path / "set", "v2.1") / lerobot.INFO
+    info = lerobot_set(tmp_path / "set", "v2.1") / lerobot.INFO
     content = json.loads(info.read_text())
     content["features"] |= {"odd": None, "odder": 3}
     info.write_text(json.dumps(content))
@@ -134,7 +132,7 @@ def test_a_feature_of_lerobot_without_a_shape(tmp_path: Path, value: Any):
 def test_tasks_of_lerobot_without_a_column(tmp_path: Path, version: str, columns: dict[str, Any]):
     """The message lists the columns that are there."""
     pa = pytest.importorskip("pyarrow")
-    folder = data_set(tmp_path / "set", version)
+    folder = lerobot_set(tmp_path / "set", version)
     if version == "v3.0":
         pytest.importorskip("pyarrow.parquet").write_table(
             pa.table(columns), folder / lerobot.TASKS[1]
@@ -151,7 +149,7 @@ def test_tasks_of_lerobot_without_a_column(tmp_path: Path, version: str, columns
 def test_a_number_of_lerobot_that_is_none(tmp_path: Path, column: str, value: Any):
     """The columns that cut a file into episodes."""
     pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-    path = next(data_set(tmp_path / "set", "v3.0").glob("data/**/*.parquet"))
+    path = next(lerobot_set(tmp_path / "set", "v3.0").glob("data/**/*.parquet"))
     whole = parquet.read_table(path)
     parquet.write_table(
         whole.drop_columns([column]).append_column(column, pa.array([value] * len(whole))), path
@@ -163,7 +161,7 @@ def test_a_number_of_lerobot_that_is_none(tmp_path: Path, column: str, value: An
 @pytest.mark.parametrize("value", ["abc", np.inf, np.array([1, 2]), h5py.Empty("f8")], ids=repr)
 def test_a_range_of_octave_without_a_length(tmp_path: Path, value: Any):
     """OCTAVE_RANGE_NELEM says how many numbers a range has."""
-    path = written(tmp_path / "a.h5")
+    path = octave(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:
         file["t/value"].attrs["OCTAVE_RANGE_NELEM"] = value
     with pytest.raises(FormatError, match="OCTAVE_RANGE_NELEM"):
@@ -172,7 +170,7 @@ def test_a_range_of_octave_without_a_length(tmp_path: Path, value: Any):
 
 def test_a_range_of_octave_without_a_base(tmp_path: Path):
     """A range that is plain numbers."""
-    path = written(tmp_path / "a.h5")
+    path = octave(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:
         del file["t/value"]
         file["t/value"] = np.zeros(3)

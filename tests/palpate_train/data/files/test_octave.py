@@ -2,55 +2,26 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
 from palpate_train.data import raw_files
 from palpate_train.data.files.table import ReadPlan
+from tests.factories.foreign_files import OCTAVE, octave
 
-SKIN = np.random.default_rng(0).integers(0, 250, (2, 8, 1600), np.uint8)
 TIMES = np.arange(1600) * 0.01
-RANGE = np.dtype([("base", "<f8"), ("limit", "<f8"), ("increment", "<f8")])
 HEAD = "# Created by Octave 7.3.0, Sat Nov 28 13:11:25 2026 UTC <user@host>\n"
-
-
-def variable(file: h5py.Group, name: str, kind: bytes, value: object = None) -> h5py.Group:
-    """A variable as `save -hdf5` stores it; a structure without a value."""
-    one = file.create_group(name)
-    one.attrs["OCTAVE_NEW_FORMAT"] = np.uint8(1)
-    one["type"] = np.bytes_(kind)
-    if value is not None:
-        one["value"] = value
-    return one
-
-
-def written(path: Path) -> Path:
-    """The file of `save -hdf5 FILE skin t run c name z e ok`, as Octave's own."""
-    with h5py.File(path, "w") as file:
-        variable(file, "skin", b"uint8 matrix", SKIN.T)
-        for where in (file, variable(file, "run", b"scalar struct").create_group("value")):
-            t = variable(where, "t", b"double_range", np.array((0, 15.99, 0.01), RANGE))
-            t["value"].attrs["OCTAVE_RANGE_NELEM"] = np.int64(1600)
-        cell = variable(file, "c", b"cell").create_group("value")
-        cell["dims"] = np.array([1, 1])
-        variable(cell, "_0", b"float matrix", np.arange(40, dtype="f4").reshape(10, 4))
-        variable(file, "name", b"sq_string", np.zeros((4, 1), "i1"))
-        variable(file, "z", b"complex matrix", np.zeros((3, 3), [("real", "f8"), ("imag", "f8")]))
-        variable(file, "e", b"matrix", np.zeros(2, "i8")).attrs["OCTAVE_EMPTY_MATRIX"] = np.uint8(1)
-        variable(file, "ok", b"bool", 1.0)
-    return path
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.mat", "a.dat"])
 def test_hdf5_has_octaves_order_of_axes(tmp_path: Path, name: str):
     """Whatever its name; ranges are times; no remark on axes."""
-    path = written(tmp_path / name)
+    path = octave(tmp_path / name)
     inside = "run.t" if name == "a.mat" else "run/t"
     for time in ("t", inside):
         found = raw_files.read(path, ReadPlan("skin", time))
-        np.testing.assert_array_equal(found.values, SKIN)
+        np.testing.assert_array_equal(found.values, OCTAVE)
         np.testing.assert_allclose(found.vectors[time], TIMES)
         assert not found.reversible
     with pytest.raises(FormatError) as refused:
@@ -94,11 +65,11 @@ def test_text_has_its_types_and_shapes(tmp_path: Path, kind: str, name: str):
 def test_text_of_several_axes(tmp_path: Path):
     """The first axis runs fastest."""
     path = tmp_path / "a.txt"
-    numbers = "\n".join(f" {n}" for n in SKIN.ravel(order="F"))
+    numbers = "\n".join(f" {n}" for n in OCTAVE.ravel(order="F"))
     path.write_text(
         f"{HEAD}# name: skin\n# type: uint8 matrix\n# ndims: 3\n 2 8 1600\n{numbers}\n\n"
     )
-    np.testing.assert_array_equal(raw_files.read(path).values, SKIN)
+    np.testing.assert_array_equal(raw_files.read(path).values, OCTAVE)
     path.write_text(path.read_text()[:-20])
     with pytest.raises(FormatError, match="skin"):
         raw_files.read(path)

@@ -7,30 +7,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data.files import tekscan
 from palpate_train.data.files.table import ReadPlan, Table
 from palpate_train.data.files.text import lines_of
-
-FRAMES = np.arange(12 * 3 * 4).reshape(12, 3, 4)
-HEAD = """DATA_TYPE MOVIE
-VERSION I-Scan 7.60
-SENSOR_TYPE 5051
-ROWS 3
-COLS 4
-ROW_SPACING 1.27 mm
-SECONDS_PER_FRAME 0.01
-START_FRAME 1
-END_FRAME 12
-UNITS Raw
-ASCII_DATA @@
-
-"""
-
-
-def movie(frames: np.ndarray = FRAMES, head: str = HEAD, tail: str = "") -> str:
-    """A movie as I-Scan exports it."""
-    blocks = [
-        f"Frame {k}\n" + "".join(",".join(map(str, row)) + tail + "\n" for row in frame.tolist())
-        for k, frame in enumerate(frames, 1)
-    ]
-    return head + "\n".join(blocks) + "\n@@\n"
+from tests.factories.foreign_files import FRAMES, HEAD, movie
 
 
 def read(text: str) -> Table:
