@@ -64,8 +64,8 @@ def _check_bytes(settings: Config, profile: SkinProfile, devices: Devices, secon
     path = settings.skin.port or find(profile.ids, settings.skin.serial, serial_port.ports())
     log.info(f"listening at {path}: {seconds:g} s at {profile.baud} baud")
     opened = _opener(devices.clock, wait=devices.wait)
-    listener = skin_detect.Listener(opened, devices.clock)
-    heard = listener.listen(path, profile.baud, profile, seconds)
+    ports = skin_detect.Ports(opened, devices.clock)
+    heard = ports.listen(path, profile.baud, profile, seconds)
     lines, good = skin_bytes.report(profile, heard.data)
     print(*lines, sep="\n")
     return 0 if good else 1
@@ -123,7 +123,7 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
     if ports:
         names = ", ".join(port.path for port in ports)
         log.info(f"listening at {names}; some seconds at each")
-    for one in skin_detect.Listener(_opener(clock), clock).detect(ports, profiles, write=write):
+    for one in skin_detect.Ports(_opener(clock), clock).detect(ports, profiles, write=write):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
         if one.proposal:
             print(one.proposal, flush=True)
@@ -147,7 +147,7 @@ def run_new(args: argparse.Namespace) -> int:
     log.info(f"listening at {port}")
     grid = (wire.rows, wire.cols) if args.grid else None
     bauds = (args.baud,) if args.baud else skin_detect.BAUDS
-    text, sample = skin_detect.Listener(_opener(clock), clock).propose(port, {}, grid, bauds)
+    text, sample = skin_detect.Ports(_opener(clock), clock).propose(port, {}, grid, bauds)
     if not text:
         line = skin_text.odd_line(sample.data)
         what = repr(line) if line else f"{len(sample.data)} bytes, and no text"

@@ -86,8 +86,8 @@ def described(format: SweepFormat) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Listener:
-    """Listens at serial ports. open_port: opens one at a speed; raises SensorError."""
+class Ports:
+    """Serial ports with unknown skins. open_port: opens one at a speed; raises SensorError."""
 
     open_port: OpenPort
     clock: Clock

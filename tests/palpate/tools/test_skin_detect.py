@@ -25,7 +25,7 @@ def found_on(
     port: WirePort, clock: VirtualClock, info: PortInfo = PORT, **options: bool
 ) -> PortFinding:
     """The finding on a port."""
-    (found,) = skin_detect.Listener(port.open, clock).detect([info], PROFILES, **options)
+    (found,) = skin_detect.Ports(port.open, clock).detect([info], PROFILES, **options)
     return found
 
 
@@ -98,7 +98,7 @@ def test_a_port_that_is_held():
     free = WirePort(clock, lambda i: wire("matrix", i), 1e7)
     ports = {"/dev/a": held, "/dev/b": free}
     infos = [PortInfo(path, 1, 2) for path in ports]
-    listener = skin_detect.Listener(lambda path, baud: ports[path].open(path, baud), clock)
+    listener = skin_detect.Ports(lambda path, baud: ports[path].open(path, baud), clock)
     first, second = listener.detect(infos, PROFILES)
     assert first.profile == ""
     assert "another program" in first.detail
@@ -157,7 +157,7 @@ def test_lines_of_numbers_are_described(sent, grid, rows):
     """Log lines between frames are passed over; the text before each frame of rows is not."""
     clock = VirtualClock()
     port = WirePort(clock, sent, 1e7)
-    text, _ = skin_detect.Listener(port.open, clock).propose("/dev/a", {}, grid)
+    text, _ = skin_detect.Ports(port.open, clock).propose("/dev/a", {}, grid)
     assert text.startswith(f'about = "{rows} taxels' if rows else "")
     assert bool(text) == bool(rows)
 
@@ -188,7 +188,7 @@ def test_other_speeds_are_tried_until_one_gives_text(baud):
         right: WirePort(clock, (lambda i: bytes([200] * 9), numbers)[right], 1e7)
         for right in (False, True)
     }
-    text, _ = skin_detect.Listener(lambda p, b: ports[b == baud].open(p, b), clock).propose(
+    text, _ = skin_detect.Ports(lambda p, b: ports[b == baud].open(p, b), clock).propose(
         "/dev/a", {}
     )
     assert f"baud = {baud}" in text
