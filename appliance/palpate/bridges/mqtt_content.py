@@ -13,14 +13,16 @@ from palpate.client.answers import Answer
 QUIET = ("finger", "fingers", "time_s", "source", "missed", "share")
 """Fields of an answer that a verdict leaves out, or has in another form."""
 PERCENT = {"unit_of_measurement": "%", "state_class": "measurement"}
+ASIDE = {"entity_category": "diagnostic"}
+"""Fields of a fact about the box: Home Assistant shows it on the device's page alone."""
 ENTITIES: tuple[tuple[str, str, str, Mapping[str, str]], ...] = (
     ("verdict", "verdict", "value_json.material or value_json.status", {}),
     ("probability", "verdict", "(100 * value_json.probability) | round(1)", PERCENT),
-    ("status", "verdict", "value_json.status", {}),
+    ("status", "verdict", "value_json.status", ASIDE),
     ("reason", "verdict", "(value_json.reason | string)[:255]", {}),
     ("ready", "state", "'ON' if value_json.ready else 'OFF'", {"platform": "binary_sensor"}),
-    ("skin", "state", "value_json.skin", {}),
-    ("bundle", "state", "value_json.bundle", {}),
+    ("skin", "state", "value_json.skin", ASIDE),
+    ("bundle", "state", "value_json.bundle", ASIDE),
     ("sweeps", "state", "value_json.answered", {"state_class": "total_increasing"}),
 )
 """What Home Assistant shows: its name, the topic, the expression for its value (a state has at most
