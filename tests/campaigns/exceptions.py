@@ -23,7 +23,7 @@ from palpate.core import config
 from palpate.core.errors import ApplianceError, LineError, ModelError, SensorError
 from palpate.core.log import log
 from palpate.core.observer import Observer
-from palpate.core.types import Edge, EdgeKind, Status, Verdict
+from palpate.core.types import Edge, EdgeKind, Status
 from palpate.io.robot_link import Command
 from palpate.runtime import assembly
 from palpate.runtime.loop import FAILURES, Box
@@ -37,7 +37,7 @@ SLIDE_S, PAUSE_S, END_S = 2.6, 0.4, 8.5
 SURVIVES = re.compile(r"answerer|early|observer\..*")
 """Calls whose unexpected errors must not end the program."""
 LASTING = re.compile(
-    r"answerer|early|observer\..*|sensor\.read|trigger\.edges|lines\..*|port\.(?!send).*"
+    r"answerer|early|observer\..*|sensor\.read|trigger\.edges|lines\..*|port\.(?!say).*"
 )
 """Calls that may fail again and again: devices, models, observers. Others only compute."""
 
@@ -132,12 +132,11 @@ class RobotPort:
         self._clock, self._asks = clock, deque(asks)
         self.answers: list[tuple[int, str]] = []
 
-    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Note an answer."""
-        self.answers.append((verdict.sweep, str(verdict.status)))
-
     def say(self, line: bytes) -> None:
-        """Other sentences do not matter."""
+        """Note an answer; other sentences do not matter."""
+        _, kind, number, _, status, *_ = [*line.decode().split(","), "", "", ""]
+        if kind == "RES":
+            self.answers.append((int(number), status))
 
     def commands(self) -> list[Command]:
         """The commands that are due."""

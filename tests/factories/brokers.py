@@ -103,9 +103,9 @@ class TopicFlood:
 
 
 class Subscriber:
-    """Reads `topic` with mosquitto_sub, which shares no code with the bridge's client. messages:
-    (topic, text) in order. heard: is called with each. kept: the broker keeps what comes while it
-    is away."""
+    """Reads `topic` with mosquitto_sub, which shares no code with the bridge's client, without the
+    commands, which are countless in a flood. messages: (topic, text) in order. heard: is called
+    with each. kept: the broker keeps what comes while it is away."""
 
     def __init__(
         self,
@@ -118,6 +118,7 @@ class Subscriber:
         self.messages: list[tuple[str, str]] = []
         self._heard, self._to = heard, ("-h", "127.0.0.1", "-p", str(port))
         words = ["mosquitto_sub", *self._to, "-q", "1", "-F", "%t %p", "-t", topic, "-t", "test/up"]
+        words += ["-T", "palpate/+/command"]
         words += ["-c", "-i", "reader"] if kept else []
         self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         self._thread = threading.Thread(target=self._read, daemon=True)

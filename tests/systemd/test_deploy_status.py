@@ -15,7 +15,8 @@ class AnsweringBox:
     def run(self, what, command, *, user="", **more):
         self.asked.append((command, user))
         return {answer!r}
-runs = deploy._runs(AnsweringBox(), deploy.BundleArchive("{sha}", "one 1", b""), "/s", "/r/status")
+archive = deploy.BundleArchive("{sha}", "one 1", 1, b"")
+runs = deploy._runs(AnsweringBox(), archive, "/s", "/r/status")
 print(json.dumps([runs, AnsweringBox.asked, deploy.MOST_STATUS]))
 """
 

@@ -66,7 +66,8 @@ export function sentence(of) {
 }
 
 function drawOne(where, of, shown) {
-  const one = byId(where), text = JSON.stringify([of?.counts]);
+  const one = byId(where);
+  const text = JSON.stringify((of?.counts ?? []).map(([status, label, n]) => [status, label && shown(label), n])); // names may come later
   put(`${where}-counted`, sentence(of));
   put(`${where}-kept`, !of?.counts ? "" : of.kept_s ? "Counted since the page's program was started. To keep 90 days: sudo systemctl enable --now palpate-bridge@memory" : "");
   if (one.dataset.shown === text) return;
