@@ -353,7 +353,7 @@ def main() -> int:
         "--out",
         type=Path,
         default=RESULTS,
-        help="the table goes into README.md beside it, if there is one",
+        help="the table goes into docs/robots/README.md",
     )
     args = parser.parse_args()
     real_time = (
@@ -363,9 +363,7 @@ def main() -> int:
     found = measure(args.minutes, args.seed, REAL_TIME if real_time else ())
     content = {"commit": commit(), "seed": args.seed, "real_time": real_time, "load": load, **found}
     storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
-    readme = args.out.with_name("README.md")
-    if readme.exists():
-        page.write(readme, "side-by-side", table(content))
+    page.write(ROOT / "docs" / "robots" / "README.md", "side-by-side", table(content))
     print(table(content))
     for text in (bad := worse(content["boxes"])):
         print(f"FAIL {text}")
