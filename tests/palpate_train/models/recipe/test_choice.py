@@ -261,19 +261,20 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """The usual, magnitudes, without spectrum; where copies are wanted all see them."""
+    """The usual candidate, magnitudes, without spectrum; then with copies, and so on. Where copies
+    are wanted, all see them."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
-    assert len(tried) == len(set(tried)) == 2 + 1 + 2
+    assert len(tried) == len(set(tried)) == 2 + 1 + 5
     said = [line.removeprefix("choosing: ") for line in (*tried[:3], tried[-1])]
     assert said[0].split(", ") == ["magnitudes", "shares", "distribution"]
     assert said[1:3] == ["magnitudes", "without spectrum"]
-    assert said[3] == "the spectrum alone"
+    assert said[3].split(", ") == ["the spectrum alone", "with copies"]
     tried.clear()
     chosen = choice.choose(scores(), candidates([[0]], [0, 1], [2, 3]), tried.append)
-    assert len(tried) == 2
+    assert len(tried) == 2 + 1
     assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
-    tried: list[str] = []
+    tried.clear()
     heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
     chosen = choice.choose(scores(), heads, tried.append)
     assert all(part.copies for part in chosen.plan.parts)

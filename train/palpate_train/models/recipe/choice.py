@@ -289,9 +289,8 @@ Heads = tuple[HeadPart, ...]
 @dataclass(frozen=True)
 class Candidates:
     """The heads to choose from. copies: whether all discriminants see augmented copies at first,
-    because the skin will be put back; for a skin in place no set chose them. loads:
-    whether held-out groups can show what loads are good for; the level of one session names its
-    materials.
+    because the skin will be put back. loads: whether held-out groups can show what loads are good
+    for; the level of one session names its materials.
 
     Sweeps are too few to distinguish more candidates than these.
     """
@@ -322,12 +321,18 @@ class Candidates:
         return {"magnitudes, shares, distribution": usual, "magnitudes": magnitudes}
 
     def extended(self, best: Heads) -> dict[str, Heads]:
-        """The best plain candidate with the spectrum, and the spectrum alone."""
-        bands = self.columns.bands
-        if not len(bands):
-            return {}
-        alone = HeadPart(tuple(bands.tolist()), self.copies)
-        return {"with the spectrum": _with(best, bands), "the spectrum alone": (alone,)}
+        """The best plain candidate with the spectrum and with copies, and the spectrum alone."""
+        bands, kept = self.columns.bands, "without more of the spectrum"
+        bases = {kept: best}
+        if len(bands):
+            bases["with the spectrum"] = _with(best, bands)
+            bases["the spectrum alone"] = (HeadPart(tuple(bands.tolist()), self.copies),)
+        return {
+            f"{name}{', with copies' * copies}": tuple(replace(p, copies=copies) for p in parts)
+            for name, parts in bases.items()
+            for copies in sorted({self.copies, True})
+            if (name, copies) != (kept, self.copies)
+        }
 
     def reduced(self) -> dict[str, Callable[[Heads], Heads]]:
         """Views to leave out of the usual candidate: each changes heads to heads without it."""

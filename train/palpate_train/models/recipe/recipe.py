@@ -143,14 +143,13 @@ class Setup:
 
     @cached_property
     def copies(self) -> list[Dataset]:
-        """Augmented copies of the sweeps, if heads can see them."""
-        count = COPIES if self.settings.use.reattached or self.settings.steps else 0
-        return list(copies(self.sweeps, self.augmentation, self.run.seed, count))
+        """Augmented copies of the sweeps."""
+        return list(copies(self.sweeps, self.augmentation, self.run.seed, COPIES))
 
     @cached_property
     def fixed(self) -> FixedFeatures:
         """Step 1: the features that need no training."""
-        self.part(1)(f"features of {len(self.sweeps)} sweeps and {len(self.copies)} copies of each")
+        self.part(1)(f"features of {len(self.sweeps)} sweeps and {COPIES} copies of each")
         trunk = fixed_trunk(self.sweeps, self.run.seed, self.settings.use.mains_hz)
         scales = trunk.architecture.relations
         columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
@@ -228,13 +227,12 @@ class Setup:
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
-        features = trunk.features(self.sweeps, int8)
         of_copies = [trunk.features(one, int8) for one in self.copies]
         source = np.tile(np.arange(len(self.sweeps)), len(self.copies))
         return HeadData(
-            features,
+            trunk.features(self.sweeps, int8),
             self.sweeps.labels,
-            np.concatenate([features[:0], *of_copies]),
+            np.concatenate(of_copies),
             source,
             self.values,
             self.sweeps.groups.get(WEIGHT),
