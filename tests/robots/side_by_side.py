@@ -353,7 +353,7 @@ def main() -> int:
         "--out",
         type=Path,
         default=RESULTS,
-        help="the table goes into docs/robots/README.md",
+        help="the table of the usual file goes into docs/robots/README.md",
     )
     args = parser.parse_args()
     real_time = (
@@ -363,7 +363,8 @@ def main() -> int:
     found = measure(args.minutes, args.seed, REAL_TIME if real_time else ())
     content = {"commit": commit(), "seed": args.seed, "real_time": real_time, "load": load, **found}
     storage.put(args.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
-    page.write(ROOT / "docs" / "robots" / "README.md", "side-by-side", table(content))
+    if args.out == RESULTS:
+        page.write(ROOT / "docs" / "robots" / "README.md", "side-by-side", table(content))
     print(table(content))
     for text in (bad := worse(content["boxes"])):
         print(f"FAIL {text}")

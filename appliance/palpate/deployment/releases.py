@@ -39,8 +39,6 @@ MOST_BYTES = 1 << 14
 FAULTS = ("SEGV", "ABRT", "BUS", "ILL", "FPE", "TRAP", "SYS")
 """Signals that a program gets for its own fault; ABRT also if it hangs, from the watchdog. KILL is
 counted as a start: a person or a lack of memory sends it."""
-
-
 SYSTEMD = Path("/run/systemd/system")
 """It is there where systemd runs (sd_booted(3))."""
 RELOADED = (
