@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -75,50 +76,68 @@ class SlideCheck:
         return NO_SLIDE if self._meter(window).height < CHANCE else None
 
 
+@dataclass(frozen=True, slots=True)
+class Slid:
+    """What is measured of a window to judge others by: height of the pattern that passes, 0 where
+    the skin cannot show one; median vibration of its parts."""
+
+    height: float
+    vibration: float
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """why: the reason why a window is not a slide, None if none is seen. certain: whether it is
+    judged by sweeps of its own material. unchecked: what could not be seen, "" if all."""
+
+    why: str | None = None
+    certain: bool = True
+    unchecked: str = ""
+
+
 class SlidesAmong:
-    """Checks windows of one format where no bundle knows the skin: a window without a pattern is
-    not a slide if those before it showed one. unchecked: what `among` could not see, "" if all."""
+    """Judges windows of one format by one another, where no bundle knows the skin: a window without
+    a pattern is not a slide if the others show one; if they show none, a window rests that vibrates
+    less than the others of its material."""
 
     def __init__(self, format: SweepFormat) -> None:
-        self._meter, self._heights = SlideMeter(format, 1.0), list[float]()
-        self.unchecked = ""
+        self._meter = SlideMeter(format, 1.0)
 
-    def __call__(self, taxels: NDArray[Any]) -> str | None:
-        """As SlideCheck."""
-        if self._meter.why is not None:
-            return None
-        height = self._meter(taxels).height
-        if _patterned(self._heights) and height < CHANCE:
-            return NO_SLIDE
-        self._heights.append(height)
-        return None
+    def measured(self, taxels: NDArray[Any]) -> Slid:
+        """The measures of a window [T, R, C] or [T, R, C, A]."""
+        height = 0.0 if self._meter.why is not None else self._meter(taxels).height
+        parts = vibration(taxels, np.zeros(taxels.shape[1:])) if len(taxels) > PARTS else [0.0]
+        return Slid(height, float(np.median(parts)))
 
-    def among(self, windows: Iterable[NDArray[Any]], materials: Sequence[str]) -> list[str | None]:
-        """The reason for each of these windows, of `materials`. They are judged by one another; if
-        they show no pattern, by the vibration of those of their material."""
-        vibrations = []
-        for taxels in windows:
-            self._heights.append(0.0 if self._meter.why is not None else self._meter(taxels).height)
-            parts = vibration(taxels, np.zeros(taxels.shape[1:])) if len(taxels) > PARTS else [0.0]
-            vibrations.append(float(np.median(parts)))
-        if _patterned(self._heights):
-            return [NO_SLIDE if one < CHANCE else None for one in self._heights]
-        self.unchecked = UNCHECKED if len(vibrations) >= MANY else ""
+    def __call__(self, one: Slid, own: Sequence[Slid], among: Sequence[Slid]) -> Judgement:
+        """own: sweeps of its material, among: of all; mostly slides, this one may be among them."""
+        if _patterned(among):
+            if one.height >= CHANCE:
+                return Judgement()
+            return Judgement(NO_SLIDE, certain=_patterned(own))
+        if len(own) < MANY:
+            return Judgement(unchecked=f"rest not checked: it takes {MANY} sweeps of the material")
+        if one.vibration < float(np.median([other.vibration for other in own])) - QUIET:
+            return Judgement(RESTS)
+        return Judgement()
+
+    def among(
+        self, windows: Iterable[NDArray[Any]], materials: Sequence[str]
+    ) -> tuple[list[str | None], str]:
+        """The reason for each of these windows, of `materials`, and what could not be seen."""
+        found = [self.measured(taxels) for taxels in windows]
         of = {
-            own: [v for v, name in zip(vibrations, materials, strict=True) if name == own]
+            own: [one for one, name in zip(found, materials, strict=True) if name == own]
             for own in materials
         }
-        pairs = zip(vibrations, materials, strict=True)
-        return [RESTS if _rests(one, of[own]) else None for one, own in pairs]
+        pairs = zip(found, materials, strict=True)
+        unchecked = UNCHECKED if len(found) >= MANY and not _patterned(found) else ""
+        return [self(one, of[own], found).why for one, own in pairs], unchecked
 
 
-def _rests(own: float, of_material: Sequence[float]) -> bool:
-    return len(of_material) >= MANY and own < float(np.median(of_material)) - QUIET
-
-
-def _patterned(heights: Sequence[float]) -> bool:
-    """Whether slides on a skin show a pattern, by the heights of sweeps that are mostly slides."""
-    return len(heights) >= MANY and float(np.median(heights)) >= CLEAR
+def _patterned(slid: Sequence[Slid]) -> bool:
+    """Whether slides on a skin show a pattern, by sweeps that are mostly slides."""
+    return len(slid) >= MANY and float(np.median([one.height for one in slid])) >= CLEAR
 
 
 def only_taxel(load: NDArray[np.float64], contact: float) -> str | None:

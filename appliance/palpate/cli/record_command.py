@@ -29,7 +29,7 @@ from palpate.runtime import assembly
 from palpate.runtime.reporting import capture, done, feed, status
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_check import SweepCheck
+from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
 
 if TYPE_CHECKING:
     from palpate.web.record import RecordPage
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         pages = page(args.web, settings, format, devices, *talk)
         _announce(format, folder)
         reports = _observers(settings, format, devices.source, recording)
-        check = SweepCheck(format, devices.clock)
+        check = SweepCheck(format, devices.clock, SlidesBefore(format, recording))
         box = assembly.assembled(
             *(settings, check, devices, port, stack),
             capture=capture(args.capture, settings, format, stack),

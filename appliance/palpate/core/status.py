@@ -82,7 +82,7 @@ DETAILS: Mapping[Reason, str] = MappingProxyType(
         Reason.NO_NUMBER: "the model gives no number",
         Reason.ANOTHER_OBJECT: "another object: {label} after {before}",
         Reason.REST_NEEDED: "the rest of the sweep is needed",
-        Reason.UNCHECKED: "contact not checked: the skin was not both touched and let go so far",
+        Reason.UNCHECKED: "{what}",
         Reason.STILL: "no taxel changes: check the cable",
         Reason.NOT_A_SLIDE: "{why}",
     }

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.answer.slide_check import SlidesAmong
+from palpate.answer.slide_check import Judgement
 from palpate.core import storage
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
@@ -23,7 +23,7 @@ from palpate.core.log import log
 from palpate.core.names import TypedNames
 from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import CommandHandler, Reply
-from palpate.core.types import SweepFormat
+from palpate.core.types import Sweep, SweepFormat
 from palpate.io.robot_link import Command
 from palpate.io.verdict_lines import check_bits
 from palpate.learn import install, materials
@@ -34,7 +34,7 @@ from palpate.runtime.loop import Box
 from palpate.runtime.reporting import capture, feed, status
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_check import SweepCheck
+from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
 
 NOTHING, GOOD = "nothing taught yet", 8
 """The model of a box that is being taught, in status and feed; and its wanted number of sweeps."""
@@ -149,8 +149,7 @@ class RecordingPhase(Phase):
         self._session = session = self._lesson(say)
         stack.callback(session.close)
         self._teacher = Teacher(session, () if again else lesson.labels, lesson.good)
-        slides = slide_check(program.base.bundle) if program.base else SlidesAmong(program.format)
-        check = SweepCheck(program.format, devices.clock, slides)
+        check = SweepCheck(program.format, devices.clock, self._slides(), teaching=True)
         self.box = assembly.assembled(
             *(settings, check, devices, port, stack),
             capture=capture(lesson.capture, settings, program.format, stack),
@@ -175,6 +174,12 @@ class RecordingPhase(Phase):
             )
         )
         return bool(session.taught)
+
+    def _slides(self) -> Callable[[Sweep], Judgement]:
+        if not self._program.base:
+            return SlidesBefore(self._program.format, self._recording)
+        known = slide_check(self._program.base.bundle)
+        return lambda sweep: Judgement(known(sweep.frames.taxels))
 
     def _lesson(self, say: Callable[[bytes], None]) -> TeachingSession:
         """The session beside a recording. Raises ConfigError for a label that it refuses."""

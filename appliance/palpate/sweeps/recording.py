@@ -131,6 +131,18 @@ class RecordingSession(Observer):
         """The name that UNDO would take away, and the former name; ("", "") if it undoes none."""
         return self._undo[-1].names if self._undo else ("", "")
 
+    def counted(self) -> dict[int, str]:
+        """The material of each sweep in the folder that counts, by its number."""
+        return {number: labels.material for number, labels in self._counted.items()}
+
+    def awaited(self, sweep: Sweep) -> tuple[int, str]:
+        """The number and material that a sweep will have in the folder."""
+        return self._folder.run + sweep.id, self._labels_of(sweep).material
+
+    def path(self, number: int) -> Path:
+        """The file of a sweep."""
+        return self._folder.path(number)
+
     def materials(self) -> dict[str, int]:
         """The number of sweeps in the folder of each material, without forgotten ones."""
         kept = (labels.material for _, labels in sorted(self._counted.items()) if labels.material)
@@ -223,8 +235,7 @@ class RecordingSession(Observer):
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
         self._answered = True
-        since = (labels for t_ns, labels in reversed(self._labels) if t_ns <= sweep.start_ns)
-        labels = next(since, Labels())
+        labels = self._labels_of(sweep)
         sweep = replace(sweep, **entries(labels))
         self._writing[self._folder.run + sweep.id] = labels.material
         report = partial(self._report_outcome, sweep, verdict, labels)
@@ -313,6 +324,11 @@ class RecordingSession(Observer):
         self._count(number, labels, str(status) if status.faulty else gone)
         fault = f" {status}" if status.faulty else ""
         return self._folder.path(number).stem + fault + " no material" * (not labels.material)
+
+    def _labels_of(self, sweep: Sweep) -> Labels:
+        """The labels that applied at its start edge."""
+        since = (labels for t_ns, labels in reversed(self._labels) if t_ns <= sweep.start_ns)
+        return next(since, Labels())
 
     def _change(self, name: str, text: str) -> list[object]:
         """Set a label for sweeps that start from now on; returns the labels that then apply."""

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from palpate.answer.slide_check import Judgement
 from palpate.core.errors import ApplianceError
-from palpate.core.types import Status, SweepFormat
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.sim import devices, rig, skin
-from palpate.sweeps.sweep_check import SweepCheck
+from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_check import NO_CONTACT_YET, SlidesBefore, SweepCheck
 from tests.factories.simulated_box import Rigged, tubes
 from tests.factories.simulated_box import played as played_acts
 from tests.factories.toy_bundle import frames_of, sweep_of
@@ -145,17 +149,69 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
     one[:, 2, 1] = on[:1500].max(axis=(1, 2))
     resting, sliding, broken = on[:1500], on[100:1600], slide(0)[:1500]
 
-    def answers(given: Callable[[np.ndarray], str] | None) -> list[tuple[Status, str]]:
-        check = SweepCheck(skin.FORMAT, rig.VirtualClock(), given)
+    def answers(judged: Judgement | None, *, teaching: bool) -> list[tuple[Status, str]]:
+        def slides(sweep: Sweep) -> Judgement:
+            return judged if sweep.frames.taxels is resting else Judgement()
+
+        given = slides if judged else None
+        check = SweepCheck(skin.FORMAT, rig.VirtualClock(), given, teaching=teaching)
         stream(check, off, on)
         verdicts = [check(sweep_of(taxels)) for taxels in (one, resting, sliding, broken)]
         return [(v.status, v.detail) for v in verdicts]
 
     dead = (Status.DEAD_TAXEL, "taxel 2.2")
-    assert answers(None) == [(Status.RECORDED, "")] * 3 + [dead]
-    assert answers(lambda taxels: "no slide: it rests" if taxels is resting else None) == [
-        (Status.NO_SLIDE, "only taxel 3.2 is loaded"),
-        (Status.NO_SLIDE, "no slide: it rests"),
-        (Status.RECORDED, ""),
-        dead,
-    ]
+    good, doubt = (Status.RECORDED, ""), Judgement("it rests", certain=False)
+    alone = (Status.NO_SLIDE, "only taxel 3.2 is loaded")
+    refused = (Status.NO_SLIDE, "it rests")
+    assert answers(None, teaching=False) == [good] * 3 + [dead]
+    assert answers(doubt, teaching=True) == [alone, refused, good, dead]
+    assert answers(doubt, teaching=False) == [good, (Status.RECORDED, "it rests"), good, dead]
+    sure = Judgement("it rests")
+    assert answers(sure, teaching=False) == [good, refused, good, dead]
+
+
+class Folder:
+    """A recording of a skin of two taxels, whose slides show no pattern."""
+
+    format = SweepFormat(1, 2, 100.0, 200, "uint8")
+
+    def __init__(self, folder: Path) -> None:
+        self.clock, self._rng, self._id = rig.VirtualClock(), np.random.default_rng(3), 0
+        self.session = RecordingSession(folder, self.format, Labels(), self.clock, lambda line: 0)
+        self.check = SweepCheck(self.format, self.clock, SlidesBefore(self.format, self.session))
+
+    def sweep(self, material: str, deviation: float = 12) -> Verdict:
+        """Record a sweep that vibrates so."""
+        self.session.commands["MATERIAL"](material)
+        counts = self._rng.normal(100, deviation, (200, 1, 2))
+        self._id += 1
+        sweep = replace(
+            sweep_of(np.rint(counts).astype(np.uint8)), id=self._id, start_ns=self.clock.now_ns()
+        )
+        verdict = self.check(sweep)
+        self.session.sweep(sweep, verdict, {})
+        return verdict
+
+
+def test_a_recording_compares_the_vibration_with_sweeps_before_of_the_material(tmp_path):
+    """From the fourth on, the three before it too; until then it says that it does not. Sweeps of
+    an earlier run count, discarded ones and other materials do not."""
+    box = Folder(tmp_path)
+    box.sweep("oak", 1)
+    box.session.commands["DISCARD"]("")
+    first = [box.sweep("oak", deviation) for deviation in (12, 1, 12, 12)]
+    assert [v.status for v in first] == [Status.RECORDED] * 4
+    assert ["rest not checked" in v.detail for v in first] == [True] * 3 + [False]
+    assert "sweep 3 " in first[3].detail
+    assert "rests" in first[3].detail
+    resting, smooth = box.sweep("oak", 1), box.sweep("felt", 1)
+    assert (resting.status, "rests" in resting.detail) == (Status.NO_SLIDE, True)
+    assert smooth.status is Status.RECORDED
+    assert box.session.materials() == {"oak": 4, "felt": 1}
+    box.session.close()
+    again = Folder(tmp_path)
+    assert (again.sweep("oak", 1).status, again.sweep("oak").detail) == (
+        Status.NO_SLIDE,
+        NO_CONTACT_YET,
+    )
+    again.session.close()

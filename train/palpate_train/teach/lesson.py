@@ -49,14 +49,14 @@ class Lesson:
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
         kept = _of_one_format(kept, left_out)
         check = SlidesAmong(kept[0].format)
-        slides = check.among(
+        slides, unchecked = check.among(
             (one.sweep.frames.taxels for one in kept), [one.sweep.material for one in kept]
         )
         kept, no_slides = slides_alone(kept, slides)
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = from_recorded(_named(kept), folder, Dataset)
         names = tuple(one.path.stem for one in kept)
-        return cls(labels.check(sweeps), names, left_out, no_slides, check.unchecked)
+        return cls(labels.check(sweeps), names, left_out, no_slides, unchecked)
 
     @property
     def _beside(self) -> str:
