@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.core import config, storage
+from palpate.core import config
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleDenied, ConfigError
@@ -50,13 +49,6 @@ def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
     except PermissionError as e:
         how = "use the service's rights: sudo -u palpate palpate ..., with the same command"
         raise BundleDenied(f"{e.filename}: this user may not read the bundle; {how}") from e
-
-
-def check_output(path: Path) -> None:
-    """Raise ConfigError if a file cannot be written, before the work whose result it gets."""
-    why = storage.refused(path)
-    if why:
-        raise ConfigError(f"{path} cannot be written: {why}; name a file in a folder of yours")
 
 
 def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:

@@ -93,15 +93,6 @@ OPTIONS: Mapping[str, _Row] = {
     "raw": ("--raw", "print the sentences alone", _FLAG),
     "settings": _instead("--settings", "cli.look_commands.run_settings",
         "print each setting with its source instead"),
-    "bench": _instead("--bench", "cli.simulated_commands.run_bench",
-        "measure latency, memory, start and processor share of this machine instead, with sweeps of"
-        " --seed (default 2000)"),
-    "figures": ("--json", "bench: write the figures", _FILE),
-    "references": ("--references", "bench: folder of fp32.onnx and paper_int8.onnx",
-        {"type": Path, "default": Path("build/references"), "metavar": "DIR"}),
-    "part": ("--part", "bench: measure a part alone, as JSON, with the sweeps of --acts",
-        {"choices": ("memory", "stream")}),
-    "acts": ("--acts", argparse.SUPPRESS, _FILE),
     "json": ("--json", "print it as JSON", _FLAG | {"default": argparse.SUPPRESS}),
     "network": ("--network", "what is open on which box of this network (zeroconf)", _FLAG),
     "since": ("--since", "what the verdicts of this time were, such as 8h or 30d (palpate bridge"

@@ -68,9 +68,8 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
             f"{_SKIN} sweeps raw"),
     },
     "look": {
-        "check": _Row("test bundle, golden sweeps and devices, show the settings, or measure this"
-            " machine", "cli.look_commands.run_check",
-            f"{_SKIN} settings|bench figures references part acts"),
+        "check": _Row("test bundle, golden sweeps and devices, or show the settings",
+            "cli.look_commands.run_check", f"{_SKIN} settings"),
         "status": _Row("show the state of the service, and its last verdicts",
             "cli.status_command.run", "json since network"),
         "watch": _Row("show the running box live: a line a verdict, or a page",

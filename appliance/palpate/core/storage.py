@@ -81,16 +81,6 @@ def file(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def refused(path: Path) -> str:
-    """Why `put` could not write `path` now; "" if it could. Nothing is written."""
-    folder = path.parent
-    if path.is_dir():
-        return "it is a folder"
-    if not folder.is_dir():
-        return f"there is no folder {folder}"
-    return "" if os.access(folder, os.W_OK | os.X_OK) else f"this user may not write to {folder}"
-
-
 def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
     """Write one file under its own name, synced if `durable`."""
     with open(path, "wb") as f:

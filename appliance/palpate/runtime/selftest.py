@@ -57,7 +57,7 @@ def check(
     """Check all components in turn, also after a failure; the skin also without a bundle. spent_ns:
     processor time that this thread has taken so far."""
     loaded: list[Bundle] = []
-    yield from _of_bundle(settings, load, devices, loaded)
+    yield from _of_bundle(settings, load, devices, loaded, spent_ns)
     if loaded:
         yield CheckResult("speed", True, _speed(loaded[0].manifest))
     yield _try(
@@ -69,7 +69,11 @@ def check(
 
 
 def _of_bundle(
-    settings: Config, load: Callable[[], Bundle], devices: Devices, loaded: list[Bundle]
+    settings: Config,
+    load: Callable[[], Bundle],
+    devices: Devices,
+    loaded: list[Bundle],
+    spent_ns: Callable[[], int],
 ) -> Iterator[CheckResult]:
     """The bundle, which is put into `loaded`, and its golden sweeps."""
 
@@ -89,10 +93,15 @@ def _of_bundle(
 
     def golden() -> str:
         classifier = Classifier(loaded[0], devices.clock)
+        begun_ns = spent_ns()
         worst = classifier.self_test()
+        each_ms = (spent_ns() - begun_ns) / 1e6 / len(loaded[0].golden)
         if settings.classifier.early:
             EarlyExit(classifier)
-        return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
+        return (
+            f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}, "
+            f"{each_ms:.2g} ms of the processor for each"
+        )
 
     yield _try("bundle", bundle)
     if settings.classifier.allow_unsigned:

@@ -267,7 +267,7 @@ def test_check_needs_no_bundle(tmp_path, capsys):
 
 def test_folders_and_files_that_are_not_there(tmp_path, capsys):
     """Nothing is begun."""
-    none, json_file = str(tmp_path / "none"), ["check", "--bench", "--json"]
+    none = str(tmp_path / "none")
     for words, code, said in (
         (["check", "--settings", "--config-dir", none], 78, none),
         (
@@ -275,14 +275,11 @@ def test_folders_and_files_that_are_not_there(tmp_path, capsys):
             65,
             "not a sweep set",
         ),
-        ([*json_file, str(tmp_path)], 78, "folder"),
-        ([*json_file, str(tmp_path / "no" / "x.json")], 78, "no folder"),
     ):
         assert main(words) == code
         told = capsys.readouterr().err
         assert said in told
         assert "pickle" not in told
-    assert not (tmp_path / "no").exists()
 
 
 def test_a_box_without_rights_names_the_service_s(capsys, monkeypatch):

@@ -69,7 +69,7 @@ def test_a_signed_bundle_may_be_named(box, capsys):
         assert f", {said}" in lines[0]
 
 
-def test_simulations_and_benches_take_any_bundle(box, capsys):
+def test_simulations_take_any_bundle(box, capsys):
     """Sentences say so; with the setting after a warning, here without a trigger line."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     sim = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]

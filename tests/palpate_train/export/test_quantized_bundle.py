@@ -26,8 +26,7 @@ from palpate.core.types import SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import skin
-from palpate_studies import cost
-from palpate_studies.command import main as study
+from palpate_studies import cost, references
 from palpate_train.answer import rules, stranger_limits
 from palpate_train.answer.heads import HeadData
 from palpate_train.answer.rules import RULES, Asked, present
@@ -450,7 +449,7 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
     """The paper's number of parameters, six logits, no log."""
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
-    assert study(["references", "--out", str(tmp_path / "new")]) == 0
+    references.write(tmp_path / "new")
     assert not caplog.records
     sizes = {}
     for path in (tmp_path / "new").iterdir():

@@ -98,11 +98,7 @@ REPORTS = (
     _study("paper"),
     ResultFile("overview", "overview.svg", ("palpate_studies", "overview")),
     ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
-    ResultFile(
-        "bench",
-        "data/bench.json",
-        ("palpate", "check", "--bench", "--json", "docs/data/bench.json"),
-    ),
+    ResultFile("bench", "data/bench.json", ("palpate_studies", "bench")),
     ResultFile("skins", "data/skins.json", ("tests.skins",)),
     ResultFile(
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)

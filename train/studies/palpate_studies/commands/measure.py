@@ -1,4 +1,4 @@
-"""The studies that measure: stress, certainty, alignment, references."""
+"""The studies that measure: stress, certainty, alignment, bench."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_studies import (
     alignment,
+    bench,
     certainty,
     contact_table,
-    references,
     rules_study,
     rules_table,
     stress,
@@ -56,8 +56,9 @@ def register(add: Add) -> None:
     _add_certainty(add)
     _add_alignment(add)
     _add_rules(add)
-    command = add("references", run_references)
-    options.add_folder(command)
+    command = add("bench", run_bench)
+    command.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (2000)")
+    add_out(command, "bench", kept=False)
 
 
 def _add_alignment(add: Add) -> None:
@@ -272,7 +273,6 @@ def run_alignment(args: argparse.Namespace) -> None:
     print(contact_table.table(result))
 
 
-def run_references(args: argparse.Namespace) -> None:
-    """Write the references and print their paths."""
-    for path in references.write(args.out):
-        print(path)
+def run_bench(args: argparse.Namespace) -> None:
+    """Measure, print each figure at once, and write them."""
+    save(args.out, bench.run(args.seed, lambda line: print(line, flush=True)))

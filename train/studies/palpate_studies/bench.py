@@ -1,5 +1,5 @@
-"""`palpate check --bench`: latency, inference, memory, start and processor share of this machine,
-with the simulated skin.
+"""The study `bench`: latency, inference, memory, start and processor share of this machine, with
+the packaged bundle and the simulated skin.
 
 Each figure is printed in a line, and all of them are returned with plain keys. Memory, start and
 processor share are measured in processes of their own, without parts of the bench.
@@ -24,30 +24,27 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
+from palpate.bundle import bundle as bundles
 from palpate.bundle.bundle import Bundle
 from palpate.core.clock import Clock, SystemClock
-from palpate.core.errors import BundleError
 from palpate.core.observer import Observer
 from palpate.core.provenance import commit, processor
 from palpate.core.statistics import wilson
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
+from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import devices, rig, script, skin
-from palpate.tools import bench_process
-from palpate.tools.bench_process import Build, drain
+from palpate_studies import bench_process, references
+from palpate_studies.bench_process import box, drain
 
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
-def run(
-    bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]
-) -> dict[str, Any]:
-    """All figures. report: gets a line for each figure at once. references: folder of the models
-    that are timed beside the bundle; they are made if they are missing. seed: of the simulated
-    sweeps. Raises BundleError if the references cannot be made."""
+def run(seed: int, report: Callable[[str], None]) -> dict[str, Any]:
+    """All figures. report: gets a line for each figure at once. seed: of the simulated sweeps."""
     load_before = os.getloadavg()
     figures: dict[str, Any] = {}
+    bundle = bundles.load(bundles.DEFAULT)
 
     def add(more: dict[str, Any]) -> None:
         figures.update(more)
@@ -55,11 +52,9 @@ def run(
             report(f"{key:<24} {json.dumps(value)}")
 
     add({"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id})
-    add(_whole_way(bundle.format, build, seed))
-    add({"inference_ms": _inference(bundle, references, seed)})
-    if "fp32" not in figures["inference_ms"]:
-        report("fp32 and paper_int8 were not measured: they need the desktop's tools (make bench)")
-    for name in bench_process.NAMES:
+    add(_whole_way(bundle, seed))
+    add({"inference_ms": _inference(bundle, seed)})
+    for name in bench_process.PARTS:
         add(_child(name, seed))
     add(_cold_start())
     add({"bundle_kb": _size_kb(bundle), "date": time.strftime("%Y-%m-%d", time.gmtime())})
@@ -101,7 +96,7 @@ class _Watch(Observer):
         self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
 
 
-def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+def _whole_way(bundle: Bundle, seed: int) -> dict[str, Any]:
     """Latencies of SWEEPS simulated sweeps from USB bytes to sentence, at skin positions outside
     all training sets.
 
@@ -112,14 +107,14 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     clock = rig.SkippingClock()
     watch = _Watch(clock)
     simulated = devices.build(
-        format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
+        bundle.format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
     )
     with ExitStack() as stack:
-        box, far_end = build(simulated, stack, [watch])
-        while not simulated.finished(box.answered):
-            box.step()
+        measured, far_end = box(bundle, simulated, stack, [watch])
+        while not simulated.finished(measured.answered):
+            measured.step()
             drain(far_end)
-        lost = box.counters.lost_frames
+        lost = measured.counters.lost_frames
     pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
     interval = [round(v, 4) for v in wilson(right, SWEEPS)]
@@ -130,7 +125,7 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
     return {"accuracy": accuracy, "frames_lost": lost, **figures}
 
 
-def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
+def _inference(bundle: Bundle, seed: int) -> dict[str, Any]:
     """Times of the bundle's network, of whole answers with it, of its network in float, and of the
     paper's in int8, in turns."""
     rng, classifier = np.random.default_rng(seed), Classifier(bundle, SystemClock())
@@ -140,11 +135,10 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     calls: dict[str, Callable[[], object]] = {}
     calls["int8"] = partial(classifier.logits, window)
     calls["answer"] = partial(classifier, sweep)
-    _make_references(references)
-    for name in ("fp32", "paper_int8"):
-        path = references / f"{name}.onnx"
-        if path.is_file():
-            calls[name] = partial(session(path.read_bytes()).run, None, {"sweep": window[None]})
+    with tempfile.TemporaryDirectory() as folder:
+        for path in references.write(Path(folder)):
+            run = session(path.read_bytes()).run
+            calls[path.stem] = partial(run, None, {"sweep": window[None]})
     took_ms: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
@@ -156,25 +150,12 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
     return {name: _percentiles(values[len(values) // 10 :]) for name, values in took_ms.items()}
 
 
-def _make_references(folder: Path) -> None:
-    """Let the desktop's tools write the reference models, if they are installed."""
-    if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
-        return
-    command = [sys.executable, "-P", "-m", "palpate_studies", "references", "--out", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise BundleError(
-            f"palpate_studies references failed; run it by hand: {done.stderr.strip()[-300:]}"
-        )
-
-
 def _child(name: str, seed: int) -> dict[str, Any]:
     """A part of the figures, measured in a new process."""
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
-        words = ["check", "--bench", "--part", name, "--acts", str(acts)]
-        command = [sys.executable, "-P", "-m", "palpate", *words]
+        command = [sys.executable, "-P", "-m", bench_process.__name__, name, str(acts)]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
