@@ -64,7 +64,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	  --version 3 --with displacement
 
 bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
-	$(BIN)/python -m palpate_studies bench
+	$(BIN)/python -m tests.campaigns bench
 	$(BIN)/python -m palpate_studies tables
 
 site: $(SITE) ## build the documents and the pages of results as a site: build/site/index.html

@@ -123,6 +123,10 @@ def _slow(about: str, name: str, *options: str, **more: Any) -> Campaign:
 
 
 CAMPAIGNS = {
+    "bench": _module(
+        "measure latency, memory, start and processor share of this machine",
+        "tests.campaigns.bench",
+    ),
     "pictures": _module(
         "draw the pictures of README: the page of a box at work, and the demo in a terminal",
         "tests.campaigns.pictures",

@@ -37,7 +37,7 @@ from palpate.runtime import assembly
 from palpate.runtime.loop import Box
 from palpate.sim import script
 from palpate.tools import pseudo_terminal
-from palpate_studies.bench_process import drain
+from tests.campaigns.bench_process import drain
 from tests.factories.skins import sweeps
 from tests.factories.skins.devices import on_wire
 from tests.factories.skins.player import Player

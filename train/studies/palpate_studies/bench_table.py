@@ -1,5 +1,5 @@
-"""The table of the box's time and memory, in Markdown, from docs/data/bench.json, which the
-study `bench` writes."""
+"""The table of the box's time and memory, in Markdown, from docs/data/bench.json, which
+`make bench` writes."""
 
 from __future__ import annotations
 

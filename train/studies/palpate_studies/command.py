@@ -38,7 +38,6 @@ PROGRAM = Program(
             "measure",
             "measure what each rule of the answer buys and costs: a bundle without it (simulated)",
         ),
-        "bench": ("measure", "measure latency, memory, start and processor share of this machine"),
         "reports": ("publish", "make the project's results again: the stale ones, or some by name"),
         "pages": ("publish", "draw the pages of results, with their pictures"),
         "tables": (

@@ -98,7 +98,7 @@ REPORTS = (
     _study("paper"),
     ResultFile("overview", "overview.svg", ("palpate_studies", "overview")),
     ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
-    ResultFile("bench", "data/bench.json", ("palpate_studies", "bench")),
+    ResultFile("bench", "data/bench.json", ("tests.campaigns", "bench")),
     ResultFile("skins", "data/skins.json", ("tests.skins",)),
     ResultFile(
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)

@@ -1,4 +1,4 @@
-"""The studies that measure: stress, certainty, alignment, bench."""
+"""The studies that measure: stress, certainty, alignment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_studies import (
     alignment,
-    bench,
     certainty,
     contact_table,
     rules_study,
@@ -56,9 +55,6 @@ def register(add: Add) -> None:
     _add_certainty(add)
     _add_alignment(add)
     _add_rules(add)
-    command = add("bench", run_bench)
-    command.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (2000)")
-    add_out(command, "bench", kept=False)
 
 
 def _add_alignment(add: Add) -> None:
@@ -271,8 +267,3 @@ def run_alignment(args: argparse.Namespace) -> None:
     result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
     save(args.out, result)
     print(contact_table.table(result))
-
-
-def run_bench(args: argparse.Namespace) -> None:
-    """Measure, print each figure at once, and write them."""
-    save(args.out, bench.run(args.seed, lambda line: print(line, flush=True)))

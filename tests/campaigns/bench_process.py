@@ -1,5 +1,5 @@
 """Memory and processor share, for the bench, each measured in a process of its own:
-`python -m palpate_studies.bench_process PART ACTS`.
+`python -m tests.campaigns.bench_process PART ACTS`.
 
 This module does not load the simulated skin, which is not part of the box. It must load the
 simulated board, and loads it last, so that its memory can be measured.

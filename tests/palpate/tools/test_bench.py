@@ -1,4 +1,4 @@
-"""The study `bench`: the keys of its JSON, and parts measured in own processes."""
+"""The campaign `bench`: the keys of its JSON, and parts measured in own processes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 
 from palpate.bundle import bundle
 from palpate.sim import script
-from palpate_studies import bench, bench_process
-from palpate_studies.command import main
+from tests.campaigns import bench, bench_process
 
 
 @pytest.mark.slow
@@ -19,8 +18,9 @@ def test_bench_writes_its_figures(tmp_path, monkeypatch, capsys):
     for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
-    monkeypatch.setattr(bench.references, "write", lambda folder: ())
-    assert main(["bench", "--out", str(tmp_path / "b.json")]) == 0
+    monkeypatch.setattr(bench, "_references", list)
+    monkeypatch.setattr("sys.argv", ["bench", "--out", str(tmp_path / "b.json")])
+    bench.main()
     figures = json.loads((tmp_path / "b.json").read_text())
     assert figures["accuracy"]["total"] == 6
     assert figures["frames_lost"] == 0

@@ -1,5 +1,5 @@
-"""The study `bench`: latency, inference, memory, start and processor share of this machine, with
-the packaged bundle and the simulated skin.
+"""Measures latency, inference, memory, start and processor share of this machine, with the packaged
+bundle and the simulated skin: `python -m tests.campaigns bench`.
 
 Each figure is printed in a line, and all of them are returned with plain keys. Memory, start and
 processor share are measured in processes of their own, without parts of the bench.
@@ -7,6 +7,7 @@ processor share are measured in processes of their own, without parts of the ben
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ import onnxruntime as ort
 
 from palpate.bundle import bundle as bundles
 from palpate.bundle.bundle import Bundle
+from palpate.core import storage
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.observer import Observer
 from palpate.core.provenance import commit, processor
@@ -34,9 +37,11 @@ from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import devices, rig, script, skin
-from palpate_studies import bench_process, references
-from palpate_studies.bench_process import box, drain
+from tests.campaigns import bench_process
+from tests.campaigns.bench_process import box, drain
+from tests.factories.paths import ROOT
 
+RESULTS = ROOT / "docs" / "data" / "bench.json"
 SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
 
 
@@ -78,7 +83,7 @@ def _percentiles(values: list[float]) -> dict[str, float]:
     return found | {"n": len(values)}
 
 
-class _Watch(Observer):
+class AnswerTimes(Observer):
     """Measures the latency of answers: verdicts come here after their sentences."""
 
     def __init__(self, clock: Clock) -> None:
@@ -105,7 +110,7 @@ def _whole_way(bundle: Bundle, seed: int) -> dict[str, Any]:
     time stamp of the stop edge to the same moment (glitch filter, rest of a packet).
     """
     clock = rig.SkippingClock()
-    watch = _Watch(clock)
+    watch = AnswerTimes(clock)
     simulated = devices.build(
         bundle.format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
     )
@@ -135,10 +140,8 @@ def _inference(bundle: Bundle, seed: int) -> dict[str, Any]:
     calls: dict[str, Callable[[], object]] = {}
     calls["int8"] = partial(classifier.logits, window)
     calls["answer"] = partial(classifier, sweep)
-    with tempfile.TemporaryDirectory() as folder:
-        for path in references.write(Path(folder)):
-            run = session(path.read_bytes()).run
-            calls[path.stem] = partial(run, None, {"sweep": window[None]})
+    for name, model in _references():
+        calls[name] = partial(session(model).run, None, {"sweep": window[None]})
     took_ms: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
         for name, call in calls.items():
@@ -148,6 +151,16 @@ def _inference(bundle: Bundle, seed: int) -> dict[str, Any]:
                 call()
                 took_ms[name].append((time.perf_counter_ns() - start) / 1e6)
     return {name: _percentiles(values[len(values) // 10 :]) for name, values in took_ms.items()}
+
+
+def _references() -> list[tuple[str, bytes]]:
+    """Names and content of the models for comparison; none on a board without the studies."""
+    if not find_spec("palpate_studies"):
+        return []
+    from palpate_studies import references
+
+    with tempfile.TemporaryDirectory() as folder:
+        return [(path.stem, path.read_bytes()) for path in references.write(Path(folder))]
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:
@@ -182,3 +195,17 @@ def _machine() -> dict[str, Any]:
     python = {"python": platform.python_version()}
     versions = {"numpy": np.__version__, "onnxruntime": ort.__version__}
     return system | python | versions | {"processor": processor()}
+
+
+def main() -> None:
+    """Measure, print each figure at once, and write them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=2000, help="of the simulated sweeps (2000)")
+    parser.add_argument("--out", type=Path, default=RESULTS, help=f"({RESULTS})")
+    args = parser.parse_args()
+    figures = run(args.seed, lambda line: print(line, flush=True))
+    storage.put(args.out, (json.dumps(figures, indent=1) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()
