@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.io import skin_profile
+from palpate.io.serial_sensor import requests
 from palpate.io.skin_profile import SkinProfile
 from tests.factories.paths import ROOT
 from tests.factories.skins.devices import on_wire
@@ -29,11 +30,10 @@ class Subject:
         return wire(self.name, self.profile.rate_hz)
 
     def sent(self, skin: Wire, i: int) -> bytes:
-        """The bytes of frame `i`."""
-        return skin.frame(
-            on_wire(self.frames[i % len(self.frames)], self.profile),
-            round(1e6 * i / self.profile.rate_hz),
-        )
+        """The bytes of frame `i`; a skin that answers is asked for it."""
+        taxels = on_wire(self.frames[i % len(self.frames)], self.profile)
+        data = skin.frame(taxels, round(1e6 * i / self.profile.rate_hz))
+        return data + b"".join(map(skin.receive, requests(self.profile)))
 
 
 @lru_cache

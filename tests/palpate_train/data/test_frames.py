@@ -213,6 +213,8 @@ def test_times_may_have_their_unit_behind_each(form: str):
         "2026-01-31_12:59:{0:06.3f}",
         "20260131T1259{0:06.3f}Z",
         "20260131_1259{1:02d}_{2:03d}",
+        "59:{0:06.3f}",
+        "2 days 00:59:{0:09.6f}",
     ],
 )
 def test_dates_of_other_forms_give_the_times(form: str):

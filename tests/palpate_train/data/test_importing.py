@@ -235,7 +235,7 @@ BAD = {
     "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is ''"),
     "nan": (GOOD.encode() + b"1,nan,3,4\n", "frame 21, taxel 1, 2 is nan"),
     "numbers": (bytes([1, 0, 0, 0] * 99), "is not a text"),
-    "sound": (b"RIFF\x24\x08\0\0WAVEfmt \x10\0\0\0" + b"\1\2" * 900, "is not a text"),
+    "sound": (b"RIFF\x24\x08\0\0WAVEfmt \x10\0\0\0" + b"\1\2" * 900, "is a sound"),
     "floats": (np.arange(2000, dtype="<f4").tobytes(), "is not a text"),
     "bytes behind": (b"1,2,3,4\n" * 20 + bytes([1, 2, 3]) * 99, "is not a text"),
     "wide": (b"1,2,3,4,5\n" * 20, "see --columns and --grid"),

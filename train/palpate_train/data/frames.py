@@ -27,13 +27,16 @@ _NAMED = r"\d{1,2}\.?[- ][^\W\d_]{3,9}\.?[- ]\d{2,4}|[A-Za-z]{3,9} \d{1,2}(?:,? 
 MOMENT = re.compile(
     r"(?:(?:[A-Z][a-z]{1,8},? )?"
     rf"(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ,_-]+)?"
-    r"(?P<hour>\d{1,2}):(?P<minute>\d\d)"
+    r"(?:(?P<since>\d+) days?,? )?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
     r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3}(?:\d{3})?)?))?\s?(?P<noon>[aApP][mM])?"
     r"\s?(?P<zone>Z|UTC|GMT|[+-]\d\d:?\d\d)?(?P<year> \d{4})?"
 )
-"""A time of the day, perhaps with its date and zone; the year may stand at the end."""
+"""A time of the day, perhaps with its date and zone; the year may stand at the end. Or a time since
+the beginning, with its days."""
 COMPACT = re.compile(r"(\d{4})(\d\d)(\d\d)[T_ -](\d\d)(\d\d)(\d\d)(?:[._,](\d+))?(Z?)")
 """The same in digits alone."""
+MINUTES = re.compile(r"(\d{1,2}):(\d\d[.,]\d+)")
+"""Minutes and seconds alone, as spreadsheets write times below an hour."""
 MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 NAMED_DAY = re.compile(
     r"(?:(?P<first>\d{1,2})[- ])?(?P<month>[A-Za-z]+)(?:[- ](?P<second>\d{1,2}),?)?"
@@ -199,6 +202,7 @@ def _dates(name: str, table: Table, at: int) -> Array:
     if at not in table.texts:
         raise FormatError(f"column {name} holds numbers, not dates; name their unit")
     texts = [COMPACT.sub(_apart, text.strip()) for text in table.texts[at]]
+    texts = [f"0:{text}" if MINUTES.fullmatch(text) else text for text in texts]
     found = [MOMENT.fullmatch(text) for text in texts]
     if None in found:
         k = found.index(None)
@@ -208,7 +212,7 @@ def _dates(name: str, table: Table, at: int) -> Array:
         )
     parts = [one.groupdict("") for one in found if one]
     days = _days(name, [one["day"] + one["year"] for one in parts])
-    clock = np.array([_clock_s(one) for one in parts])
+    clock = np.array([_clock_s(one) + DAY_S * int(one["since"] or 0) for one in parts])
     if not any(one["day"] for one in parts):  # times of the day begin again at midnight
         days = np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY_S / 2)
     times: Array = (days - days[0]) * DAY_S + clock - clock[0]
@@ -345,6 +349,8 @@ def column_numbers(
     for part in (text,) if text in names else text.split(","):
         if part in names:
             found.append(_named(part, names, option))
+        elif (bare := part.lstrip("#% ")) in names:  # the sign of a comment before the first name
+            found.append(_named(bare, names, option))
         elif number := RANGE.fullmatch(part):
             first, last = int(number[1]), int(number[2] or number[1])
             if not first <= last <= wide:

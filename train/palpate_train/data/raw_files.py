@@ -45,6 +45,7 @@ BINARY: Mapping[tuple[str, ...], Reader] = {
     zarr_store.SUFFIXES: zarr_store.read,
 }
 """Readers by the suffixes of their files. Other files are HDF5 or text."""
+POINTER = b"version https://git-lfs"
 LIBRARIES = (sheets.read, parquet.read, tdms.read, bags.read, zarr_store.read)
 DAMAGED = (
     *UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
@@ -82,6 +83,11 @@ REMEDIES = {
 MAGIC = {
     b"PK\x03\x04": "a zip archive; give it the suffix of its format, such as .xlsx or .npz",
     b"\x1f\x8b": "packed with gzip; unpack it",
+    b"BZh": "packed with bzip2; unpack it",
+    b"\xfd7zXZ": "packed with xz; unpack it",
+    b"RIFF": "a sound or a video; export its samples as CSV or .npy",
+    b"<!DOCTYPE": "a web page; download the file itself",
+    b"<html": "a web page; download the file itself",
     b"%PDF": "a document; export the numbers as CSV",
     b"\x89PNG": "a picture; export the counts as CSV or .npy",
     b"PAR1": "a Parquet file; give it the suffix .parquet",
@@ -117,6 +123,8 @@ def arrays_of(path: Path) -> tuple[str, ...]:
 
 def _read(path: Path, wanted: ReadPlan) -> Table:
     suffix = path.suffix.lower()
+    if path.is_file() and path.open("rb").read(len(POINTER)) == POINTER:
+        raise FormatError("is a pointer of Git LFS; fetch its content with git lfs pull")
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
     if zarr_store.is_store(path):
         reader = zarr_store.read
@@ -137,7 +145,7 @@ def _read(path: Path, wanted: ReadPlan) -> Table:
     data = path.read_bytes()
     if remedy := next((why for magic, why in MAGIC.items() if data.startswith(magic)), ""):
         raise FormatError(f"is {remedy}")
-    if suffix in json_lines.SUFFIXES or data[:1] == b"{":
+    if suffix in json_lines.SUFFIXES or (data[:1] == b"{" and data[1:2] != b"'"):
         return json_lines.read(data, wanted)
     content, notes = text.decoded(data)
     lines = text.lines_of(content)

@@ -36,6 +36,9 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
         (lambda row: f"tensor([{' '.join(map(str, row))}]),", "brackets"),
         (lambda row: f"[[{row[0]}, {row[1]}], [{row[2]}, {row[3]}]]", "brackets"),
         (joined(",", "'{}'"), "single quotes"),
+        (lambda row: repr(f"{row}\r\n".encode()), "bytes+brackets"),
+        (lambda row: f'"{row}"', "lists"),
+        (lambda row: f'{row[0]};"[{row[1]} {row[2]} {row[3]}]"', "lists"),
         (joined(",", "{} mV"), "units"),
         (joined(";", "{}N"), "units"),
         (joined(",", "{:x}".replace("{", "0x{")), "hexadecimal"),
@@ -43,14 +46,16 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
         (labelled(",", ":"), ""),
         (labelled(" ", "="), ""),
         (labelled(", ", " = "), ""),
+        (lambda row: str(dict(zip(NAMES, row, strict=True))), "brackets+single quotes"),
         (joined("|", " {} "), ""),
     ],
 )
 def test_decorations_are_left_out(tmp_path: Path, line: Callable[[list[int]], str], what: str):
-    """The numbers are read, and a remark names the decoration."""
+    """The numbers are read, and a remark says each decoration."""
     found = read(tmp_path, line)
     np.testing.assert_array_equal(found.values, SKIN)
-    assert [what in said for said in found.notes] == [True] * bool(what)
+    wanted = what.split("+") if what else []
+    assert all(one in said for one, said in zip(wanted, found.notes, strict=True))
     if "s1" in line(SKIN[0].tolist()):
         assert found.columns == NAMES
 
@@ -71,17 +76,26 @@ def test_signs_of_typographers_are_read(tmp_path: Path):
     np.testing.assert_array_equal(found.values, -SKIN)
 
 
-def test_the_serial_monitors_clock_is_a_column(tmp_path: Path):
-    """With labels, too; its times can be used."""
+@pytest.mark.parametrize("sign", [",", " "])
+@pytest.mark.parametrize(
+    ("before", "mark", "clock"),
+    [("", " -> ", "12:00:01.100"), ("[2026-01-31 ", "] ", "2026-01-31T12:00:01.100")],
+)
+def test_the_serial_monitors_clock_is_a_column(
+    tmp_path: Path, before: str, mark: str, clock: str, sign: str
+):
+    """Of Arduino and of Tera Term. With labels, too; its times can be used."""
     text = "\n".join(
-        f"12:00:0{i // 10}.{i % 10}00 -> " + ",".join(map(str, row))
+        f"{before}12:00:0{i // 10}.{i % 10}00{mark}" + sign.join(map(str, row))
         for i, row in enumerate(SKIN.tolist())
     )
     (tmp_path / "a.txt").write_text(text)
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
-    assert found.texts[0][11] == "12:00:01.100"
-    (tmp_path / "a.txt").write_text(text.replace("-> ", "-> force:").replace(",", ",b:"))
+    assert found.texts[0][11] == clock
+    if sign == " ":
+        return
+    (tmp_path / "a.txt").write_text(text.replace(mark, f"{mark}force:").replace(",", ",b:"))
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     assert found.columns == ("clock", "force", "b", "b", "b")

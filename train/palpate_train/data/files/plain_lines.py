@@ -16,10 +16,15 @@ SAMPLED = 200
 """Number of lines that show the decorations of a text."""
 USUAL = 0.8
 """Share of the lines with digits that have a decoration, if it is removed."""
-CLOCK = re.compile(r"^\s*(\d\d:\d\d:\d\d(?:[.,]\d+)?)\s*->\s*(.*)$")
-"""The time that the serial monitor of Arduino writes before a line."""
+_STAMP = r"(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d(?:[.,]\d+)?"
+CLOCK = re.compile(rf"^\s*\[?({_STAMP})(?:\]|\s*->)\s*(.*)$")
+"""The time that the serial monitor of Arduino, or Tera Term in brackets, writes before a line."""
 LABEL = re.compile(r"(?<![\w.])([A-Za-z_][\w.\-\[\]]*)\s*[=:]\s*(?=[-+.\d])")
-BRACKETS = re.compile(r"^\s*(?:array|tensor)?\s*[\[({].*\d")
+BYTES = re.compile(r"^\s*b(['\"])(.*?)(?:\\r)?(?:\\n)?\1\s*$")
+"""A line of bytes as Python prints it."""
+CELL = re.compile(r'"\[\s*([-+.\d][-+.\deE, ]*?)\s*\]"')
+"""A list in a cell, as pandas writes it."""
+BRACKETS = re.compile(rf"^\s*(?!\[{_STAMP}\])(?:array|tensor)?\s*" + r"[\[({].*\d")
 QUOTED = re.compile(r"'([^',;\t]*\d)'")
 HEXADECIMAL = re.compile(r"(?<![\w.])0[xX]([0-9a-fA-F]{1,8})(?![\w.])")
 FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d)")
@@ -82,7 +87,12 @@ def _unlabelled(line: str, names: Sequence[str]) -> str:
 def _clocked(found: re.Match[str]) -> str:
     """The time as a cell of its own."""
     sign = next((s for s in (";", "\t", ",") if s in found[2]), " ")
-    return f"{found[1].replace(',', '.')}{sign}{found[2]}"
+    return f"{found[1].replace(',', '.').replace(' ', 'T')}{sign}{found[2]}"
+
+
+def _spread(found: re.Match[str]) -> str:
+    """The numbers of a list as cells."""
+    return (";" if ";" in found.string else ",").join(found[1].replace(",", " ").split())
 
 
 def _separated(line: str) -> bool:
@@ -107,6 +117,8 @@ class Rewriting:
 _NO_BRACKETS = str.maketrans("", "", "[](){}")
 _REWRITINGS = (
     Rewriting("comments behind numbers", REMARK.search, partial(REMARK.sub, ""), True),
+    Rewriting("marks of bytes", BYTES.search, partial(BYTES.sub, r"\2")),
+    Rewriting("brackets of lists", CELL.search, partial(CELL.sub, _spread)),
     Rewriting("brackets", BRACKETS.match, _unbracketed),
     Rewriting("single quotes", QUOTED.search, partial(QUOTED.sub, r"\1")),
     Rewriting("units of the cells", UNITS.search, partial(UNITS.sub, "")),
