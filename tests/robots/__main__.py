@@ -3,7 +3,7 @@ connections side by side.
 
 Two boxes sweep simulated tubes in real time: the first has a serial line and the bridges on its
 feed, the second `bridge tcp` on its line. Needs ROS 2 (python -m tests.campaigns ros). On a machine
-with other work: chrt -f 10 python -m tests.robots.
+with other work: chrt -f 10 python -m tests.robots. A sweep takes 4 s, twice, and the rest 2 minutes.
 """
 
 import argparse
@@ -45,6 +45,9 @@ from tests.robots import page
 
 RESULTS = ROOT / "docs" / "data" / "robots-latency.json"
 POLL_S = 0.01
+CONNECTIONS = "serial", "tcp", "feed", "modbus", "mqtt", "opcua", "ros"
+SWEEP_S, START_S = 10, 120
+"""Longest time for a sweep, of which one takes 4 s, and for the start of all bridges."""
 Seen = Callable[[int], None]
 """Called with the number of each sweep whose answer has arrived."""
 
@@ -69,18 +72,10 @@ class Times:
         """Record that a connection had the answer to a sweep at this time."""
         self._there[connection, box].setdefault(sweep, at_ns)
 
-    def done(self, sweeps: int) -> bool:
-        """Whether each connection has this many answers."""
-        there = {*self._there} >= {
-            ("serial", "A"),
-            ("tcp", "B"),
-            ("feed", "A"),
-            ("modbus", "A"),
-            ("mqtt", "A"),
-            ("opcua", "A"),
-            ("ros", "A"),
-        }
-        return there and min(map(len, self._there.values())) >= sweeps
+    def missing(self, sweeps: int) -> list[str]:
+        """The connections that do not have this many answers yet."""
+        answers = {connection: len(there) for (connection, _), there in self._there.items()}
+        return [name for name in CONNECTIONS if answers.get(name, 0) < sweeps]
 
     def latencies_ms(self) -> dict[str, list[float]]:
         """Latencies in ms of each connection."""
@@ -249,7 +244,10 @@ def run(sweeps: int) -> dict[str, list[float]]:
         threading.Thread(
             target=poll, args=(modbus, times.seen("modbus", "A"), ending), daemon=True
         ).start()
-        while not times.done(sweeps):
+        late = time.monotonic() + START_S + SWEEP_S * sweeps
+        while missing := times.missing(sweeps):
+            if time.monotonic() > late:
+                raise SystemExit(f"no {sweeps} answers over {', '.join(missing)}; is it running?")
             ending.wait(1)
             for heard in peer.on("verdict"):
                 times.note("ros", "A", int(heard["values"]["sweep"]), heard["monotonic_ns"])
