@@ -3,7 +3,7 @@ connections side by side.
 
 Two boxes sweep simulated tubes in real time: the first has a serial line and the bridges on its
 feed, the second `bridge tcp` on its line. Needs ROS 2 (python -m tests.campaigns ros). On a machine
-with other work: chrt -f 10 python -m tests.robots. A sweep takes 4 s, twice, and the rest 2 minutes.
+with other work: chrt -f 10 python -m tests.robots. A sweep takes twice 4 s, and the rest 2 minutes.
 """
 
 import argparse

@@ -188,11 +188,11 @@ def test_urscript_by_lines(ready, answers, want):
 
 
 @pytest.mark.parametrize(
-    ("block", "program", "settings"),
-    [(0, "Toucher", {"timeout_s": 20.0}), (1, "Sweeper", {"timeout_s": 20.0, "slide_s": 0.1})],
+    ("program", "settings"),
+    [("Toucher", {"timeout_s": 20.0}), ("Sweeper", {"timeout_s": 20.0, "slide_s": 0.1})],
     ids=["services", "action"],
 )
-def test_ros(box, block, program, settings):
+def test_ros(box, program, settings):
     """ros2.md: a node in a process of its own, by services and by the action."""
     ros.required()
     ros.messages_required()
@@ -207,7 +207,9 @@ def test_ros(box, block, program, settings):
     with ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"), ros.peer() as peer:
         eventually(lambda: bool(box.say(state()) or peer.on("state")))
         with subprocess.Popen(command, env=ros.environment(), **pipes) as cell:
-            cell.stdin.write(page_blocks("ros2.md", "python")[block])
+            action = (ROOT / "docs" / "robots" / "ros2_sweep.py").read_text()
+            by_services = page_blocks("ros2.md", "python")[0]
+            cell.stdin.write(action if program == "Sweeper" else by_services)
             cell.stdin.close()
             told = [json.loads(cell.stdout.readline()) for _ in range(4)]
             cell.kill()
