@@ -118,7 +118,7 @@ function drawSweep() {
   mark(byId("status"), last.status);
   put("sweep-title", `Sweep ${last.sweep}, ${since(last.time_ns)}`);
   const wrong = last.faulty ? `${last.reason}; it does not count` : "";
-  put("outcome", [wrong, last.detail].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels; look whether the finger slid");
+  put("outcome", [wrong, last.detail].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels, rest");
   const {picture, why: none} = lastPicture();
   signal(byId("signal"), picture, none, recording?.unit || undefined);
 }
