@@ -20,7 +20,6 @@ from palpate.io.serial_sensor import SerialSensor, requests
 from palpate.io.skin_codecs import Rest
 from palpate.io.skin_profile import SkinProfile
 from palpate.sim.rig import VirtualClock
-from palpate.tools import skin_text
 from tests.factories.skins.wires import Polled, Taxels, Wire, crc16
 
 GRID = (4, 6)
@@ -225,19 +224,6 @@ def test_split_or_damaged_bytes_make_no_other_frame(name: str) -> None:
     summed = kind.profile.checksum or "text" in kind.profile.codec
     wrong = [i for i, f in zip(numbers, taken, strict=True) if not (source.frame(i) == f).all()]
     assert len(wrong) <= (0 if summed and kind.profile.codec != "text" else 1)
-
-
-@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if "index" in kind.keys])
-def test_numbered_lines_are_described_by_a_command(name: str, tmp_path: Path) -> None:
-    """What `palpate skin new` writes reads all frames."""
-    kind, source = KINDS[name], SparseFrames(GRID)
-    if kind.keys["codec"] != "text":
-        pytest.skip("no text")
-    data = b"".join(kind.wire(100.0).encode(source.frame(i)) for i in range(40))
-    (tmp_path / "own.toml").write_text(skin_text.proposed(b"1\n" + data + b"0", 1.0, GRID))
-    profile = skin_profile.load("own", [tmp_path])
-    found = skin_codecs.codec(profile)(Rest(), data)
-    np.testing.assert_array_equal(found.taxels, [source.frame(i) for i in range(40)])
 
 
 def test_requests_of_many_registers_have_length_and_checksum() -> None:

@@ -79,7 +79,6 @@ def test_a_line_of_text_that_does_not_fit():
 
 
 TEXTS = {
-    "3d-vitac": (b"".join(wire("3d-vitac", i) for i in range(20)), {"rows": 16, "cols": 16}),
     "time": (
         b"".join(b"%d,%d,%d,%d,%d\n" % (i * 10, 5, i % 3, 7, 9 - i % 4) for i in range(30)),
         {"skip_columns": [0], "rows": 2, "cols": 2, "lines": "frames"},
@@ -93,7 +92,7 @@ TEXTS = {
         {"decimal": ",", "cols": 3},
     ),
     "json": (
-        b"".join(b'{"v": [[%d, 2], [3, %d]]}\n' % (i % 9, i % 4) for i in range(30)),
+        b"".join(b'{"v": [[%d, 2], [3, %d]]}\n' % (5 * i % 9, i % 4) for i in range(30)),
         {"around": '"v":', "rows": 2, "cols": 2},
     ),
 }
@@ -113,10 +112,16 @@ def test_a_profile_is_proposed_for_lines_of_numbers(data, expected):
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"boot\nready\n" * 9, bytes(range(256)) * 4, b"1 2 3\n" * 5, b"1\n1 2\n1 2 3\n" * 9],
+    [
+        *(b"", b"boot\nready\n" * 9, bytes(range(256)) * 4, b"1 2 3\n" * 5),
+        b"1\n1 2\n1 2 3\n" * 9,
+        b"".join(b"row %d: %d 20 30 40\n" % (i % 4, i % 7) for i in range(40)),
+        b"".join(b"%d %d\n" % (i % 16, 50 + i % 7) for i in range(99)),
+        b"".join(wire("3d-vitac", i) for i in range(20)),
+    ],
 )
 def test_no_profile_is_proposed_for_anything_else(data):
-    """Too few lines, words, bytes, and lines of different lengths."""
+    """Too few lines, words, bytes, lines of different lengths, and frames of several lines."""
     assert skin_text.proposed(data, 1.0) == ""
 
 
