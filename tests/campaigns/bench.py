@@ -36,7 +36,7 @@ from palpate.core.statistics import wilson
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
-from palpate.sim import devices, rig, script, skin
+from palpate.sim import devices, script, skin
 from tests.campaigns import bench_process
 from tests.campaigns.bench_process import box, drain
 from tests.factories.paths import ROOT
@@ -83,6 +83,19 @@ def _percentiles(values: list[float]) -> dict[str, float]:
     return found | {"n": len(values)}
 
 
+class SkippingClock:
+    """Real time without waiting, to measure the computing time of the box."""
+
+    def __init__(self) -> None:
+        self._skipped_ns = 0
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns() + self._skipped_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        self._skipped_ns += max(0, t_ns - self.now_ns())
+
+
 class AnswerTimes(Observer):
     """Measures the latency of answers: verdicts come here after their sentences."""
 
@@ -109,7 +122,7 @@ def _whole_way(bundle: Bundle, seed: int) -> dict[str, Any]:
     frame of the window, both read, to the sentence at the port. edge_seen_ms: from the kernel's
     time stamp of the stop edge to the same moment (glitch filter, rest of a packet).
     """
-    clock = rig.SkippingClock()
+    clock = SkippingClock()
     watch = AnswerTimes(clock)
     simulated = devices.build(
         bundle.format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"

@@ -1,4 +1,4 @@
-"""The simulated robot and readout board on one timeline, and clocks that can skip time. Acts (the
+"""The simulated robot and readout board on one timeline, and a clock that skips time. Acts (the
 frames of a sweep and the positions of its edges) become packets as in PROTOCOL.md and edges, each
 at its time.
 
@@ -7,7 +7,6 @@ at its time.
 
 from __future__ import annotations
 
-import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator, MutableSequence
@@ -43,19 +42,6 @@ class VirtualClock:
 
     def sleep_until(self, t_ns: int) -> None:
         self._now_ns = max(self._now_ns, t_ns)
-
-
-class SkippingClock:
-    """Real time without waiting, to measure the computing time of the box."""
-
-    def __init__(self) -> None:
-        self._skipped_ns = 0
-
-    def now_ns(self) -> int:
-        return time.monotonic_ns() + self._skipped_ns
-
-    def sleep_until(self, t_ns: int) -> None:
-        self._skipped_ns += max(0, t_ns - self.now_ns())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

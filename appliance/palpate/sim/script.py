@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -59,7 +59,7 @@ def named(
     seed: int,
     *,
     spread: bool = False,
-    seen: SeenTubes | None = None,
+    seen: Any = None,
     follows: bool = False,
 ) -> tuple[Iterator[Act], str, SweepFormat]:
     """The script with this name after `--sim`, the name of the source in sentences, and the format
@@ -72,7 +72,7 @@ def named(
     """
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
-        able: list[tuple[SweepFormat, skin.World, SeenTubes]] = [
+        able: list[tuple[SweepFormat, skin.World, Any]] = [
             (world.format, world, skin) for world in (PLAYED, replace(PLAYED, shear=True))
         ]
         if seen:
@@ -100,33 +100,12 @@ def named(
     )
 
 
-class SeenTubes(Protocol):
-    """Tubes as seen by a skin on the finger: the module `skin`, or another's view."""
-
-    @property
-    def FORMAT(self) -> SweepFormat: ...
-
-    def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]: ...
-
-    def sweep(
-        self,
-        material: str,
-        placement: skin.Placement,
-        rng: Generator,
-        world: skin.World,
-        *,
-        rest_s: float,
-        slide_s: float,
-        after_s: float,
-    ) -> NDArray[Any]: ...
-
-
 def tubes(
     seed: int,
     sweeps: int | None = None,
     places: Sequence[skin.Placement] = (),
     world: skin.World = PLAYED,
-    seen: SeenTubes = skin,
+    seen: Any = skin,
     only: str = "",
     slide_s: float = SLIDE_S,
 ) -> Iterator[Act]:
@@ -153,7 +132,7 @@ def slide(
     place: skin.Placement,
     rng: Generator,
     world: skin.World,
-    seen: SeenTubes = skin,
+    seen: Any = skin,
     slide_s: float = SLIDE_S,
 ) -> Act:
     """One sweep over the tube `label`, with the finger lifted before and after it."""
@@ -166,7 +145,7 @@ def slide(
     return Act(frames, start, stop, label, lifted=len(off))
 
 
-def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
+def rests(seed: int, world: skin.World = PLAYED, seen: Any = skin) -> Iterator[Act]:
     """A finger that is lifted and put on the wooden tube again, with a shifted skin."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)
