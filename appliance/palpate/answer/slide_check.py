@@ -86,7 +86,7 @@ class Slid:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class SlideFinding:
     """why: the reason why a window is not a slide, None if none is seen. certain: whether it is
     judged by sweeps of its own material. unchecked: what could not be seen, "" if all."""
 
@@ -109,17 +109,19 @@ class SlidesAmong:
         parts = vibration(taxels, np.zeros(taxels.shape[1:])) if len(taxels) > PARTS else [0.0]
         return Slid(height, float(np.median(parts)))
 
-    def __call__(self, one: Slid, own: Sequence[Slid], among: Sequence[Slid]) -> Judgement:
+    def __call__(self, one: Slid, own: Sequence[Slid], among: Sequence[Slid]) -> SlideFinding:
         """own: sweeps of its material, among: of all; mostly slides, this one may be among them."""
         if _patterned(among):
             if one.height >= CHANCE:
-                return Judgement()
-            return Judgement(NO_SLIDE, certain=_patterned(own))
+                return SlideFinding()
+            return SlideFinding(NO_SLIDE, certain=_patterned(own))
         if len(own) < MANY:
-            return Judgement(unchecked=f"rest not checked: it takes {MANY} sweeps of the material")
+            return SlideFinding(
+                unchecked=f"rest not checked: it takes {MANY} sweeps of the material"
+            )
         if one.vibration < float(np.median([other.vibration for other in own])) - QUIET:
-            return Judgement(RESTS)
-        return Judgement()
+            return SlideFinding(RESTS)
+        return SlideFinding()
 
     def among(
         self, windows: Iterable[NDArray[Any]], materials: Sequence[str]

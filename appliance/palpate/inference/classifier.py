@@ -115,6 +115,7 @@ class Classifier(Observer):
             displaced = class_distances(bundle, settings.strangers, displaced=True)
             network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
+        self._rehearsed = [*self._cleaning, *self._measuring, network[0]]
 
     def stages(self, *network: Stage) -> list[Stage]:
         """All stages in their order. network: give the logits and refuse unknown materials."""
@@ -248,10 +249,8 @@ class Classifier(Observer):
         m, present, found = self.bundle.manifest, self._objects.present, []
         taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
         stages = [taxels, *(one for one in self._stages if one is not self.taxels)]
-        none = Frames.empty(m.format)
         for golden in self.bundle.golden[: len(self.bundle.golden) - len(self.bundle.enrolled)]:
-            sweep = Sweep(0, 0, 0, Status.OK, none)
-            status = run(stages, Context(sweep, golden, m.tare, whole=True)).status
+            status = run(stages, self._context(golden, m.tare)).status
             found.append("" if status.classified else str(status))
         self._objects.present = present
         return found
@@ -296,11 +295,19 @@ class Classifier(Observer):
     def cleaned(self, taxels: NDArray[Any]) -> NDArray[Any]:
         """One window of raw counts [T, R, C] or [T, R, C, A] as the network sees it: broken taxels
         are bridged, and hum is removed."""
-        none = Sweep(0, 0, 0, Status.OK, Frames.empty(self.format))
-        context = Context(none, taxels, self.tare, whole=True)
+        context = self._context(taxels, self.tare)
         for stage in self._cleaning:
             stage.apply(context)
         return context.taxels
+
+    def rehearse(self) -> None:
+        """Run the stages up to the network on a golden sweep. The result is dropped."""
+        run(self._rehearsed, self._context(self.bundle.golden[0], self.tare))
+
+    def _context(self, taxels: NDArray[Any], tare: NDArray[Any]) -> Context:
+        """The context of a whole window without a sweep."""
+        none = Sweep(0, 0, 0, Status.OK, Frames.empty(self.format))
+        return Context(none, taxels, tare, whole=True)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.answer.slide_check import Judgement
+from palpate.answer.slide_check import SlideFinding
 from palpate.core import storage
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
@@ -175,11 +175,11 @@ class RecordingPhase(Phase):
         )
         return bool(session.taught)
 
-    def _slides(self) -> Callable[[Sweep], Judgement]:
+    def _slides(self) -> Callable[[Sweep], SlideFinding]:
         if not self._program.base:
             return SlidesBefore(self._program.format, self._recording)
         known = slide_check(self._program.base.bundle)
-        return lambda sweep: Judgement(known(sweep.frames.taxels))
+        return lambda sweep: SlideFinding(known(sweep.frames.taxels))
 
     def _lesson(self, say: Callable[[bytes], None]) -> TeachingSession:
         """The session beside a recording. Raises ConfigError for a label that it refuses."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.slide_check import MANY, RESTS, Judgement, Slid, SlidesAmong, only_taxel
+from palpate.answer.slide_check import MANY, RESTS, Slid, SlideFinding, SlidesAmong, only_taxel
 from palpate.answer.unloaded import UnloadedTracker
 from palpate.answer.window import Window
 from palpate.answer.window_check import Finding, inspect_bare, inspect_readings
@@ -46,7 +46,7 @@ class SweepCheck(Observer):
         self,
         format: SweepFormat,
         clock: Clock,
-        slides: Callable[[Sweep], Judgement] | None = None,
+        slides: Callable[[Sweep], SlideFinding] | None = None,
         *,
         teaching: bool = False,
     ) -> None:
@@ -72,6 +72,9 @@ class SweepCheck(Observer):
                 finding = self._slid(sweep, finding.detail)
         now_ns = self._clock.now_ns()
         return Verdict.of(sweep, finding.status, now_ns, self.model, detail=finding.detail)
+
+    def rehearse(self) -> None:
+        """Nothing: no robot waits for these answers."""
 
     def _slid(self, sweep: Sweep, unchecked: str) -> Finding:
         """The finding on a sweep without a fault. unchecked: what was not checked so far."""
@@ -135,7 +138,7 @@ class SlidesBefore:
                 sweep = RecordedSweep.load(recording.path(number)).sweep
                 self._slid[number] = self._judge.measured(sweep.frames.taxels)
 
-    def __call__(self, sweep: Sweep) -> Judgement:
+    def __call__(self, sweep: Sweep) -> SlideFinding:
         """The judgement of a sweep that is not counted so far."""
         number, material = self._recording.awaited(sweep)
         counted = self._recording.counted()
@@ -143,11 +146,11 @@ class SlidesBefore:
         own = {n: slid for n, slid in before.items() if counted[n] == material}
         self._slid[number] = one = self._judge.measured(sweep.frames.taxels)
         if not material:
-            return Judgement()
+            return SlideFinding()
         found = self._judge(one, [*own.values(), one], [*before.values(), one])
-        if len(own) + 1 == MANY and found == Judgement():  # the first one that can tell
+        if len(own) + 1 == MANY and found == SlideFinding():  # the first one that can tell
             group = [*own.values(), one]
             rest = [f"{n}" for n, slid in own.items() if self._judge(slid, group, []).why]
             if rest:
-                return Judgement(unchecked=f"sweep {', '.join(rest)} of the folder: {RESTS}")
+                return SlideFinding(unchecked=f"sweep {', '.join(rest)} of the folder: {RESTS}")
         return found

@@ -75,6 +75,11 @@ class SweepCutter:
         """True between a start edge and the answer to it."""
         return bool(self._closing) or (self._open is not None and not self._open.answered)
 
+    def may_end(self, now_ns: int) -> bool:
+        """Whether the open sweep has lasted the length of a window."""
+        sweep = self._open
+        return bool(sweep and not sweep.answered and now_ns - sweep.start_ns >= self._least_ns)
+
     def put(self, frames: Frames, now_ns: int) -> None:
         """Put frames into the ring. Frames of a new enumeration end the open sweep."""
         if not len(frames):

@@ -59,6 +59,18 @@ def folder(tmp_path: Path) -> Path:
     return Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
 
 
+def test_a_rehearsal_leaves_no_trace(default_bundle):
+    """Sweeps of one object get the same verdicts whether answers are rehearsed between them."""
+    plain, rehearsed = (Classifier(default_bundle, VirtualClock()) for _ in range(2))
+    for number, golden in enumerate(default_bundle.golden[:4], 1):
+        given = replace(sweep_of(golden), id=number, object=1)
+        rehearsed.rehearse()
+        now, want = rehearsed(given), plain(given)
+        for name in ("status", "label", "probability", "fused", "after", "detail"):
+            assert getattr(now, name) == getattr(want, name)
+        np.testing.assert_array_equal(now.scores, want.scores)
+
+
 @pytest.fixture
 def toy_folder(tmp_path: Path) -> Path:
     """The folder of a toy bundle, to be damaged."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,41 @@ def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
     assert [v.status for v in verdicts].count(Status.FAILED) == 1
     assert heard(box)[0] == (1, "failed")
     assert (verdicts[0].detail, verdicts[0].label) == (str(error) or "MemoryError", "")
+
+
+class Rehearsing(FailingModel):
+    """Notes how many sweeps were answered at each rehearsal, which fails. took_ns: of an answer."""
+
+    def __init__(self, box: Rigged, took_ns: int) -> None:
+        super().__init__(box.box._answerer, lambda sweep: False, BAD_ALLOC)
+        self._box, self._took_ns, self.after = box.box, took_ns, []
+        box.box._answerer = self
+
+    def __call__(self, sweep: Sweep) -> Verdict:
+        return replace(self._answerer(sweep), latency_ns=self._took_ns)
+
+    def rehearse(self) -> None:
+        self._answerer.rehearse()
+        assert self._box._cutter.sweeping
+        self.after.append(self._box.answered)
+        raise self._error
+
+
+@pytest.mark.parametrize(("took_ms", "after"), [(2, {1, 2}), (20, set())])
+def test_quick_answers_are_rehearsed_while_a_sweep_may_end(rigged, took_ms, after):
+    """From the second sweep on, a few times; a rehearsal that fails changes no answer. A slow model
+    would cost frames."""
+    plain, other = tubes(1, 3), tubes(1, 3)
+    box = rigged(plain)
+    want = box.until(lambda: plain.finished(box.box.answered))
+    box = rigged(other)
+    rehearsing = Rehearsing(box, took_ms * 1_000_000)
+    verdicts = box.until(lambda: other.finished(box.box.answered))
+    assert [(v.status, v.label, v.scores.tolist()) for v in verdicts] == [
+        (v.status, v.label, v.scores.tolist()) for v in want
+    ]
+    assert set(rehearsing.after) == after
+    assert len(rehearsing.after) <= 60
 
 
 def test_repeated_failures_end_the_program_once_all_are_answered(rigged):

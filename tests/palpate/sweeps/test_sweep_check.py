@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.answer.slide_check import Judgement
+from palpate.answer.slide_check import SlideFinding
 from palpate.core.errors import ApplianceError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.sim import devices, rig, skin
@@ -149,9 +149,9 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
     one[:, 2, 1] = on[:1500].max(axis=(1, 2))
     resting, sliding, broken = on[:1500], on[100:1600], slide(0)[:1500]
 
-    def answers(judged: Judgement | None, *, teaching: bool) -> list[tuple[Status, str]]:
-        def slides(sweep: Sweep) -> Judgement:
-            return judged if sweep.frames.taxels is resting else Judgement()
+    def answers(judged: SlideFinding | None, *, teaching: bool) -> list[tuple[Status, str]]:
+        def slides(sweep: Sweep) -> SlideFinding:
+            return judged if sweep.frames.taxels is resting else SlideFinding()
 
         given = slides if judged else None
         check = SweepCheck(skin.FORMAT, rig.VirtualClock(), given, teaching=teaching)
@@ -160,17 +160,17 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
         return [(v.status, v.detail) for v in verdicts]
 
     dead = (Status.DEAD_TAXEL, "taxel 2.2")
-    good, doubt = (Status.RECORDED, ""), Judgement("it rests", certain=False)
+    good, doubt = (Status.RECORDED, ""), SlideFinding("it rests", certain=False)
     alone = (Status.NO_SLIDE, "only taxel 3.2 is loaded")
     refused = (Status.NO_SLIDE, "it rests")
     assert answers(None, teaching=False) == [good] * 3 + [dead]
     assert answers(doubt, teaching=True) == [alone, refused, good, dead]
     assert answers(doubt, teaching=False) == [good, (Status.RECORDED, "it rests"), good, dead]
-    sure = Judgement("it rests")
+    sure = SlideFinding("it rests")
     assert answers(sure, teaching=False) == [good, refused, good, dead]
 
 
-class Folder:
+class RecordingBox:
     """A recording of a skin of two taxels, whose slides show no pattern."""
 
     format = SweepFormat(1, 2, 100.0, 200, "uint8")
@@ -196,7 +196,7 @@ class Folder:
 def test_a_recording_compares_the_vibration_with_sweeps_before_of_the_material(tmp_path):
     """From the fourth on, the three before it too; until then it says that it does not. Sweeps of
     an earlier run count, discarded ones and other materials do not."""
-    box = Folder(tmp_path)
+    box = RecordingBox(tmp_path)
     box.sweep("oak", 1)
     box.session.commands["DISCARD"]("")
     first = [box.sweep("oak", deviation) for deviation in (12, 1, 12, 12)]
@@ -209,7 +209,7 @@ def test_a_recording_compares_the_vibration_with_sweeps_before_of_the_material(t
     assert smooth.status is Status.RECORDED
     assert box.session.materials() == {"oak": 4, "felt": 1}
     box.session.close()
-    again = Folder(tmp_path)
+    again = RecordingBox(tmp_path)
     assert (again.sweep("oak", 1).status, again.sweep("oak").detail) == (
         Status.NO_SLIDE,
         NO_CONTACT_YET,
