@@ -181,8 +181,8 @@ def _child(name: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
-        command = [sys.executable, "-P", "-m", bench_process.__name__, name, str(acts)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        command = [sys.executable, "-m", bench_process.__name__, name, str(acts)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
 
