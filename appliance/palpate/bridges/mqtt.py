@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import select
 import socket
 import ssl
@@ -41,7 +42,7 @@ KEPT = 1000
 """Verdicts that wait for the broker; then the oldest is dropped and counted."""
 FLYING = 16
 """Messages that the broker has not acknowledged, at most; the others wait here, in order. paho
-would let more wait without a bound, verdicts behind all else; brokers may allow no more than 20."""
+would let more wait without a bound, verdicts behind all else. Brokers may allow fewer."""
 LATE_NS = 1_000_000_000
 """A verdict that is sent so long after it was heard is marked late."""
 KEEPALIVE_S = 20
@@ -58,6 +59,8 @@ BUFFER = 16 * 1024
 """Bytes that wait to be read; behind more of them, acknowledgements would come seconds late."""
 AT_ONCE = 64
 """Packets that are read before verdicts are looked at again."""
+SECONDS = re.compile(r"\d{10}(\.\d*)?", re.ASCII)
+"""Seconds since 1970, as the replies have them; a date without hyphens has fewer digits."""
 WITH_WILL = ReasonCode(PacketTypes.DISCONNECT, "Disconnect with will message")
 BROKEN = (OSError, ValueError, TypeError, LookupError, AttributeError)
 """What paho raises for packets that are none, and for a connection that is not to be had."""
@@ -101,6 +104,7 @@ class MqttBridge:
         self._waiting: deque[Waiting] = deque(maxlen=KEPT)
         self._heard = self._next = 0  # verdicts so far; number of the next to send
         self._flying: dict[int, int] = {}  # message id -> number of its verdict, -1 for another
+        self._most = FLYING
         self._said: dict[str, str] = {}  # what the retained topics hold
         self._refused = ""
         self._there = False
@@ -166,12 +170,13 @@ class MqttBridge:
 
     def _connect(self) -> paho.Client:
         """A client that the broker has accepted. Raises AddressError."""
-        client = self._client()
+        client: paho.Client | None = None
         self._there, self._refused = False, ""
         end_ns = self._clock.now_ns() + round(CONNECT_S * 1e9)
         properties = Properties(PacketTypes.CONNECT)
         properties.MaximumPacketSize = MOST_BYTES
         try:
+            client = self._client()
             client.connect(
                 *(self._broker.host, self._broker.port, KEEPALIVE_S),
                 clean_start=True,
@@ -185,7 +190,7 @@ class MqttBridge:
                     self._refused = self._refused or "it has closed the connection"
         except BROKEN as e:
             self._refused = str(getattr(e, "strerror", None) or e).lower() or type(e).__name__
-        if self._there:
+        if client and self._there:
             return client
         _end(client)
         raise AddressError(
@@ -216,6 +221,7 @@ class MqttBridge:
     def _connected(self, client: Any, data: Any, flags: Any, why: ReasonCode, more: Any) -> None:
         self._there = not why.is_failure
         self._refused = str(why).lower() if why.is_failure else ""
+        self._most = min(FLYING, getattr(more, "ReceiveMaximum", FLYING))
 
     def _disconnected(self, client: Any, data: Any, flags: Any, why: Any, more: Any) -> None:
         self._there = False
@@ -225,16 +231,18 @@ class MqttBridge:
                 self._refused += f" by another box {self._name}: give each box its own --name"
 
     def _acknowledged(self, client: Any, data: Any, mid: int, why: ReasonCode, more: Any) -> None:
+        done = self._flying.pop(mid, None)
         if why.is_failure:
             self._log.warning(f"mqtt: {self._broker} refuses a message: {why}; see its rules")
-        done = self._flying.pop(mid, None)
+            self.dropped += done is not None and done >= 0
         with self._lock:
             while done is not None and self._waiting and self._waiting[0].number <= done:
                 self._waiting.popleft()
 
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
-        client.publish(f"homeassistant/device/palpate_{self._name}/config", config, 1, retain=True)
+        topic = f"homeassistant/device/palpate_{self._name}/config"
+        self._flying[client.publish(topic, config, qos=1, retain=True).mid] = -1
         client.subscribe(self._heeded)
 
     def _publish(self, client: paho.Client) -> None:
@@ -246,7 +254,7 @@ class MqttBridge:
             first = self._waiting[0].number if self._waiting else self._heard
             self._next = max(self._next, first)
             at = self._next - first
-            due = [*islice(self._waiting, at, at + max(0, FLYING - len(self._flying)))]
+            due = [*islice(self._waiting, at, at + max(0, self._most - len(self._flying)))]
         for one in due:
             text = json.dumps({**one.fields, "late": now_ns - one.heard_ns > LATE_NS})
             sent = client.publish(f"{self._base}/verdict", text, qos=1, retain=True)
@@ -260,7 +268,7 @@ class MqttBridge:
 
     def _say(self, client: paho.Client, topic: str, text: str) -> None:
         """Publish the content of a retained topic if it has changed."""
-        if self._said.get(topic) != text and len(self._flying) < FLYING:
+        if self._said.get(topic) != text and len(self._flying) < self._most:
             self._said[topic] = text
             sent = client.publish(f"{self._base}/{topic}", text, qos=1, retain=True)
             self._flying[sent.mid] = -1
@@ -330,7 +338,8 @@ class MqttBridge:
     def _since(self, text: str) -> list[Mapping[str, Any]]:
         """The results since a time, the oldest first. Raises CommandRefused."""
         try:
-            return self._results.since(wall_clock.read(text))
+            at_s = float(text) if SECONDS.fullmatch(text) else wall_clock.read(text)
+            return self._results.since(at_s)
         except (ValueError, OverflowError) as e:
             raise CommandRefused(f"{e}; send a time such as 2026-11-28T14:00:00+01:00") from e
 
@@ -339,8 +348,7 @@ class MqttBridge:
         self._wake()
 
 
-def _end(client: paho.Client) -> None:
+def _end(client: paho.Client | None) -> None:
     """Close the connection at once; without DISCONNECT the broker sends the will."""
-    line = client.socket()
-    if line is not None:
+    if client and (line := client.socket()):
         line.close()

@@ -112,7 +112,8 @@ def read_login(path: Path) -> tuple[str, str]:
                 f"{path}: everybody may read the password; chmod o= {path}, and give it to "
                 "the bridge's user"
             )
-        lines = path.read_text("utf-8").splitlines()
+        # editors of Windows put a mark first
+        lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as e:
         why = str(getattr(e, "strerror", None) or "not a text").lower()
         raise ConfigError(f"{path}: {why}; name a file with user and password") from e

@@ -51,11 +51,12 @@ def show_since(args: argparse.Namespace) -> int:
     from palpate.core import wall_clock
 
     path = Path(load_settings(args).bridge.memory)
-    from_s = wall_clock.seconds() - args.since
+    now_s = wall_clock.seconds()
+    from_s, to_s = now_s - args.since, now_s + verdicts.AHEAD_S
     if args.json:
-        print(json.dumps([*verdicts.since(path, from_s)], indent=1))
+        print(json.dumps([*verdicts.since(path, from_s, to_s=to_s)], indent=1))
         return 0
-    found = verdicts.counts(path, from_s)
+    found = verdicts.counts(path, from_s, to_s)
     print(f"{sum(found.values())} sweeps since {wall_clock.of(from_s)}")
     for (word, label), n in found.items():
         print(f"{n:8}  {word:<12}  {label}".rstrip())

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, get_type_hints
@@ -15,10 +16,18 @@ ANSWER_FIELDS, STATE_FIELDS = 12, 11
 """Fields that each RES and each STA has; others follow."""
 
 
+def _number(text: str) -> float:
+    """Raises ValueError for NaN and infinity, which no other program could read in JSON."""
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not a number")
+    return number
+
+
 def _first(kind: type, fields: Sequence[str], number: int) -> dict[str, Any]:
     """The first fields of a sentence by name, of the types in `kind`. Raises ValueError if they are
     too few or of another type."""
     hints: dict[str, Any] = get_type_hints(kind) | {"sweeping": "1".__eq__}
+    hints |= {name: _number for name, hint in hints.items() if hint is float}
     names = list(hints)[:number]
     return {n: hints[n](text) for n, text in zip(names, fields[:number], strict=True)}
 
@@ -68,7 +77,7 @@ class Answer:
                 **first,
                 detail=",".join(fields[12:13]),
                 loss_known=fields[13:14] != ["1"],
-                measured_mm_s=float(fields[14]) if "".join(fields[14:15]) else None,
+                measured_mm_s=_number(fields[14]) if "".join(fields[14:15]) else None,
                 direction="".join(fields[15:16]),
             )
         except ValueError as e:

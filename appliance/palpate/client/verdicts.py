@@ -6,9 +6,10 @@ the next is taken; the loop of the box knows nothing of it.
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,12 @@ from palpate.core.log import log
 
 DAYS, MOST_MIB = 90, 64
 """Older verdicts are deleted, and the oldest of a larger file."""
-DAY_S = 86_400
-EVERY = 100
-"""Verdicts between two looks at age and size."""
+DAY_S = AHEAD_S = 86_400
+"""Verdicts that are a day ahead of now were given while the clock was wrong; less can be a clock
+that was set right, in either direction."""
+EVERY, OLD = 100, 200
+"""Verdicts between two looks at age and size; most verdicts that one look deletes for their age: a
+clock that is wrong for a while must not empty the file."""
 WAIT_S = 10.0
 """Longest wait for another program that has the file open."""
 PART = 1000
@@ -44,8 +48,8 @@ clock. STRICT: SQLite would take a number of a wrong kind as bytes, which count 
 
 class VerdictFile:
     """The file at `path`, None for verdicts in memory alone, for its one writer. A file that is
-    damaged is moved aside. db: to read with the functions below. Raises TemporaryError if it cannot
-    be opened."""
+    damaged or of another version is moved aside. db: to read with the functions below. Raises
+    TemporaryError if it cannot be opened."""
 
     def __init__(self, path: Path | None, *, most_mib: float = MOST_MIB) -> None:
         self._path, self._most, self._since = path, most_mib * (1 << 20), 0
@@ -54,14 +58,7 @@ class VerdictFile:
         except sqlite3.OperationalError as e:
             raise TemporaryError(f"{path}: {e}; name a file in a folder of your own") from e
         except sqlite3.DatabaseError as e:
-            if path is None:
-                raise
-            aside = path.with_suffix(".damaged")
-            log.warning(f"{path}: {e}; it is kept as {aside}, and a new one begins")
-            path.rename(aside)
-            for end in ("-wal", "-shm"):
-                path.with_name(path.name + end).unlink(missing_ok=True)
-            self.db = self._open()
+            self.db = self._anew(e)
 
     def close(self) -> None:
         """Close the file."""
@@ -69,23 +66,51 @@ class VerdictFile:
 
     def add(self, at_s: float, verdict: Mapping[str, Any]) -> None:
         """Write a verdict. at_s: seconds since 1970. Raises sqlite3.Error, such as for a full
-        disk."""
+        disk; then it is not written."""
+        if self._path and not self._path.exists():  # somebody has taken it away
+            self.db.close()
+            self.db = self._open()
         values = [at_s, *(verdict.get(name) for name in COLUMNS if name != "at")]
-        names, marks = ", ".join(COLUMNS), ", ".join("?" * len(COLUMNS))
-        with self.db:
-            self.db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
+        try:
+            self._insert(values)
+        except sqlite3.DatabaseError as e:
+            if type(e) is not sqlite3.DatabaseError:  # this verdict, or the disk
+                raise
+            self.db.close()
+            self.db = self._anew(e)
+            self._insert(values)
         self._since += 1
         if self._since >= EVERY:
-            self._since = 0
-            self.trim(at_s)
+            with suppress(sqlite3.OperationalError):  # a full disk: with the next verdict
+                self.trim(at_s)
+                self._since = 0
 
     def trim(self, now_s: float) -> None:
         """Delete old verdicts, and the oldest of a file that is too large."""
         with self.db:
-            self.db.execute("DELETE FROM verdicts WHERE at < ?", [now_s - DAYS * DAY_S])
+            old = "SELECT number FROM verdicts WHERE at < ? ORDER BY number LIMIT ?"
+            limits = [now_s - DAYS * DAY_S, OLD]
+            self.db.execute(f"DELETE FROM verdicts WHERE number IN ({old})", limits)
             if self._size() > self._most:
                 tenth = "SELECT min(number) + (max(number) - min(number)) / 10 FROM verdicts"
                 self.db.execute(f"DELETE FROM verdicts WHERE number <= ({tenth})")
+
+    def _insert(self, values: list[Any]) -> None:
+        names, marks = ", ".join(COLUMNS), ", ".join("?" * len(COLUMNS))
+        with self.db:
+            self.db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
+
+    def _anew(self, why: sqlite3.DatabaseError) -> sqlite3.Connection:
+        """A new file in place of one that cannot be used. Raises sqlite3.DatabaseError."""
+        path = self._path
+        if path is None:
+            raise why
+        aside = path.with_suffix(".damaged")
+        log.warning(f"{path}: {why}; it is kept as {aside}, and a new one begins")
+        path.rename(aside)
+        for end in ("-wal", "-shm"):
+            path.with_name(path.name + end).unlink(missing_ok=True)
+        return self._open()
 
     def _size(self) -> int:
         """Bytes of the pages in use."""
@@ -107,6 +132,9 @@ class VerdictFile:
             db.execute(f"PRAGMA journal_size_limit = {4 << 20}")
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
             number = "number INTEGER PRIMARY KEY AUTOINCREMENT"
+            there = [name for _, name, *_ in db.execute("PRAGMA table_info(verdicts)")]
+            if there and there != ["number", *COLUMNS]:
+                raise sqlite3.DatabaseError("it has the columns of another version")
             with db:
                 db.execute(f"CREATE TABLE IF NOT EXISTS verdicts ({number}, {columns}) STRICT")
                 db.execute("CREATE INDEX IF NOT EXISTS by_time ON verdicts (at)")
@@ -129,13 +157,15 @@ def dated(line: Mapping[str, Any], now_ns: int) -> tuple[float, dict[str, Any]]:
     return wall_clock.seconds() - age_s, {**line, "latency_ms": line["latency_ns"] / 1e6}
 
 
-def since(source: Source, from_s: float, most: int = -1) -> Iterator[dict[str, Any]]:
-    """The first `most` verdicts since this time, in order; -1: all. Raises FeedError if the file
-    cannot be read."""
+def since(
+    source: Source, from_s: float, most: int = -1, *, to_s: float = math.inf
+) -> Iterator[dict[str, Any]]:
+    """The first `most` verdicts from this time on, in order; -1: all. to_s: none after it, such as
+    of a clock that was wrong. Raises FeedError if the file cannot be read."""
     # +at: by number, so that each part goes on where the last one ended
-    where = f"number > ? AND +at >= ? ORDER BY number LIMIT {PART}"
+    where = f"number > ? AND +at BETWEEN ? AND ? ORDER BY number LIMIT {PART}"
     query, last = f"SELECT number, {', '.join(COLUMNS)} FROM verdicts WHERE {where}", 0
-    while rows := _rows(source, query, [last, from_s]):
+    while rows := _rows(source, query, [last, from_s, to_s]):
         for row in rows:
             if most == 0:
                 return
@@ -144,18 +174,22 @@ def since(source: Source, from_s: float, most: int = -1) -> Iterator[dict[str, A
         last = rows[-1][0]
 
 
-def counts(source: Source, from_s: float) -> dict[tuple[str, str], int]:
-    """The number of verdicts since this time by status and label. Raises FeedError."""
-    query = "SELECT status, label, count(*) FROM verdicts WHERE at >= ? GROUP BY 1, 2 ORDER BY 1, 2"
-    return {(status, label): n for status, label, n in _rows(source, query, [from_s])}
+def counts(source: Source, from_s: float, to_s: float = math.inf) -> dict[tuple[str, str], int]:
+    """The number of verdicts between these times by status and label. Raises FeedError."""
+    where = "WHERE at BETWEEN ? AND ? GROUP BY 1, 2 ORDER BY 1, 2"
+    query = f"SELECT status, label, count(*) FROM verdicts {where}"
+    return {(status, label): n for status, label, n in _rows(source, query, [from_s, to_s])}
 
 
-def trend(source: Source, from_s: float, width_s: float) -> list[tuple[int, int, int, int]]:
-    """For each span of width_s since this time with verdicts: its index, and the number of all
+def trend(
+    source: Source, from_s: float, to_s: float, width_s: float
+) -> list[tuple[int, int, int, int]]:
+    """For each span of width_s between these times with verdicts: its index, and the number of all
     verdicts, of unsure ones and of unknown ones. Raises FeedError."""
     sums = "count(*), sum(status = 'unsure'), sum(status = 'unknown')"
     span = f"SELECT CAST((at - ?) / ? AS INTEGER), {sums} FROM verdicts"
-    return _rows(source, f"{span} WHERE at >= ? GROUP BY 1 ORDER BY 1", [from_s, width_s, from_s])
+    where = "WHERE at BETWEEN ? AND ? GROUP BY 1 ORDER BY 1"
+    return _rows(source, f"{span} {where}", [from_s, width_s, from_s, to_s])
 
 
 def _rows(source: Source, query: str, values: list[float]) -> list[tuple[Any, ...]]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 from palpate.client import verdicts
 from palpate.client.verdicts import Source, VerdictFile
 from palpate.core import wall_clock
-from palpate.core.errors import ConfigError, FeedError
+from palpate.core.errors import ConfigError, FeedError, FormatError
 
 SHIFT, TODAY = 0, 1
 """Periods; any other number is of days, today included."""
@@ -41,9 +42,13 @@ class History:
 
     def take(self, line: Mapping[str, Any], now_ns: int) -> None:
         """Keep the verdict of a line of the feed, if no file does. now_ns: the clock of the feed.
-        Raises KeyError or TypeError for a line of a later version."""
-        if not self._kept():
+        Raises FormatError for a line of a later version."""
+        if self._kept():
+            return
+        try:
             self._own.add(*verdicts.dated(line, now_ns))
+        except (KeyError, TypeError, sqlite3.Error) as e:
+            raise FormatError(f"a verdict of the feed is of another version ({e!r}); update") from e
 
     def counted(self, period: str) -> dict[str, Any]:
         """What a page shows of a period. from_s: its begin, seconds since 1970. kept_s: since when
@@ -51,14 +56,15 @@ class History:
         status and label. Or `why` nothing can be read."""
         source, days = self._source(), int(period)
         from_s, span_s = self._begin_s(days), SPAN_S.get(days, verdicts.DAY_S)
+        now_s = wall_clock.seconds()
         try:
-            trend = verdicts.trend(source, from_s, span_s)
-            counts = verdicts.counts(source, from_s)
+            trend = verdicts.trend(source, from_s, now_s + verdicts.AHEAD_S, span_s)
+            counts = verdicts.counts(source, from_s, now_s + verdicts.AHEAD_S)
         except FeedError as e:
             return {"why": str(e)}
         return {
             "from_s": from_s,
-            "to_s": wall_clock.seconds(),
+            "to_s": max([now_s, *(from_s + span_s * n for n, *_ in trend[-1:])]),
             "kept_s": None if source is self._path else self._own_since_s,
             "span_s": span_s,
             "trend": trend,
@@ -67,7 +73,8 @@ class History:
 
     def rows(self, period: str) -> Iterator[str]:
         """The verdicts of a period as parts of a CSV file (RFC 4180)."""
-        found = verdicts.since(self._source(), self._begin_s(int(period)))
+        to_s = wall_clock.seconds() + verdicts.AHEAD_S
+        found = verdicts.since(self._source(), self._begin_s(int(period)), to_s=to_s)
         text = io.StringIO()
         writer = csv.writer(text)
         writer.writerow(["number", "time", *list(verdicts.COLUMNS)[1:]])

@@ -334,8 +334,11 @@ class _Handler(RequestHandler):
 
     def write_error(self, status_code: int, **_: Any) -> None:
         """Answer with a line of text."""
+        self._say(f"{status_code} {self._reason}\n")
+
+    def _say(self, text: str) -> None:
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(f"{status_code} {self._reason}\n")
+        self.finish(text)
 
 
 class FileHandler(_Handler):
@@ -386,7 +389,11 @@ class AnswerHandler(_Handler):
         if content is None:
             raise HTTPError(404)
         if isinstance(content, Iterator):
-            return await self._file(content, f"palpate-{name}.csv")
+            try:
+                return await self._file(content, f"palpate-{name}.csv")
+            except ApplianceError as e:  # the file cannot be read; in its middle this ends the CSV
+                self.set_status(503)
+                return self._say(str(e))
         self.set_header("Content-Type", "application/json")
         self.finish(json.dumps(content, allow_nan=False, separators=(",", ":")))
 
@@ -397,12 +404,14 @@ class AnswerHandler(_Handler):
 
     async def _file(self, parts: Iterator[str], name: str) -> None:
         """Send parts as fast as the browser takes them."""
+        part = await self._apart(next, parts, "")
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{name}"')
         with suppress(StreamClosedError):
-            while part := await self._apart(next, parts, ""):
+            while part:
                 self.write(part)
                 await self.flush()
+                part = await self._apart(next, parts, "")
 
 
 class OrderHandler(_Handler):
@@ -436,11 +445,9 @@ class OrderHandler(_Handler):
             self.set_header("Content-Type", "application/json")
             self.finish(content)
         except ApplianceError as e:
-            self.set_status(
-                400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409
-            )
-            self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(str(e))
+            code = 400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409
+            self.set_status(code)
+            self._say(str(e))
 
     async def _done(self) -> Any:
         """The result of an order. Raises ApplianceError if it is refused; NoAnswer if it is not

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -142,7 +143,7 @@ def test_commands_only_where_they_are_allowed(server, box):
 @pytest.mark.slow
 def test_results_that_a_client_missed(server, box, tmp_path, monkeypatch):
     """Asked by time, also without --allow-writes, the bridge sends its results of this run; after a
-    restart of both it sends those of the file. A text that is no time is refused."""
+    restart of both it sends those of the file, too. A text that is no time is refused."""
     file = tmp_path / "verdicts.db"
     settings = config.load(None, [f"bridge.memory={file}"], site=NO_SITE)
     monkeypatch.setattr(config, "load", lambda board: settings)
@@ -153,14 +154,17 @@ def test_results_that_a_client_missed(server, box, tmp_path, monkeypatch):
     rows.close()
     with Subscriber(server.port) as one, bridge("mqtt", *options(server, box)):
         online(box, one)
-        for number, since in enumerate((began, datetime.now(UTC), None), 1):
+        now = datetime.now(UTC)
+        times = (began.isoformat(), now.isoformat(), str(now.timestamp()), "yesterday")
+        for number, since in enumerate(times, 1):
             box.say(result(10 + number))
             eventually(lambda n=number: f'"sweep": {10 + n}' in one.last("/verdict"))
-            one.publish("palpate/b1/since", since.isoformat() if since else "yesterday")
+            one.publish("palpate/b1/since", since)
             eventually(lambda n=number: len(one.all("/reply")) == n)
-        before, now, wrong = (each["reply"] for each in one.all("/reply"))
-        assert [row["sweep"] for row in before] == [1, 2, 3]
-        assert [(row["sweep"], row["probability"]) for row in now] == [(11, 0.9), (12, 0.9)]
+        before, after, numbered, wrong = (each["reply"] for each in one.all("/reply"))
+        assert [row["sweep"] for row in before] == [1, 2, 3, 11]
+        assert [(row["sweep"], row["probability"]) for row in after] == [(11, 0.9), (12, 0.9)]
+        assert [row["sweep"] for row in numbered] == [11, 12, 13]
         assert "yesterday" in wrong
 
 
@@ -224,6 +228,64 @@ def test_tls(tmp_path, box, caplog):
             eventually(lambda: "connected to" in caplog.text)
 
 
+def test_a_file_of_certificates_that_holds_none(tmp_path, box, caplog):
+    """A reason is logged, and the bridge goes on until asked: the file may be mended."""
+    (tmp_path / "ca.pem").write_text("no certificate")
+    words = ("--broker", "mqtts://127.0.0.1:9", "--ca", str(tmp_path / "ca.pem"))
+    with bridge("mqtt", "--port", str(box.path), *words):
+        eventually(lambda: "certificate" in caplog.text)
+
+
+@pytest.mark.slow
+def test_a_broker_that_refuses_verdicts(tmp_path, box):
+    """Each that its rules refuse is counted as dropped."""
+    required()
+    rules = [f"topic write {name}" for name in ("palpate/b1/state", "palpate/b1/status", "test/#")]
+    (tmp_path / "rules").write_text("\n".join(["topic read #", *rules, ""]))
+    with (
+        Mosquitto(tmp_path, f"acl_file {tmp_path / 'rules'}") as server,
+        Subscriber(server.port, "palpate/#") as one,
+        bridge("mqtt", *options(server, box)),
+    ):
+        online(box, one)
+        box.say(result(1), result(2))
+        eventually(lambda: '"dropped": 2' in one.last("/state"))
+    assert one.last("/verdict") == ""
+
+
+def test_a_broker_that_takes_few_messages_at_a_time(box):
+    """No more are under way than it allows; it would end the connection."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        other.settimeout(LONG_S)
+        url = f"mqtt://127.0.0.1:{other.getsockname()[1]}"
+        with bridge("mqtt", "--port", str(box.path), "--broker", url):
+            line, _ = other.accept()
+            with line:
+                line.settimeout(0.5)
+                assert line.recv(4096)[0] == 0x10
+                for number in range(20):
+                    box.say(state(), result(number))
+                line.sendall(bytes([0x20, 6, 0, 0, 3, 0x21, 0, 2]))  # Receive Maximum 2
+                sent = b""
+                with suppress(TimeoutError):
+                    while more := line.recv(65536):
+                        sent += more
+    assert published(sent) == 2
+
+
+def published(sent: bytes) -> int:
+    """The number of PUBLISH packets."""
+    found = at = 0
+    while at < len(sent):
+        size, shift, found, at = 0, 0, found + (sent[at] >> 4 == 3), at + 1
+        while True:
+            size, shift, at = size | (sent[at] & 127) << shift, shift + 7, at + 1
+            if not sent[at - 1] & 128:
+                break
+        at += size
+    return found
+
+
 @pytest.mark.parametrize("speech", [b"", b"HTTP/1.1 400\r\n\r\n", b"\x20\x03\x00\x00\x00\xff" * 9])
 def test_no_broker_at_the_address(box, caplog, speech):
     """Whatever answers there: a reason is logged, and the bridge goes on until asked."""
@@ -272,6 +334,9 @@ def test_login_files(tmp_path):
     file.chmod(0o600)
     assert broker("mqtts://x", str(file), "").user == "a"
     assert broker("mqtts://x", "", "").port == 8883
+    file.write_text("\ufeffa\r\nb\r\n", "utf-8")  # of an editor of Windows
+    found = broker("mqtts://x", str(file), "")
+    assert (found.user, found.password) == ("a", "b")
     file.write_text("a")
     with pytest.raises(ConfigError, match="two lines"):
         broker("mqtt://x", str(file), "")

@@ -81,13 +81,16 @@ def test_optional_fields_survive_their_sentence(known):
         (Answer.of, "7,1.0,strange,wood,0.9,0.8,1,0,1,b,usb,1.00,"),
         (Answer.of, "7,1.0,ok,wood,0.9,0.8,one,0,1,b,usb,1.00,"),
         (Answer.of, "7,1.0,ok,wood,0.9,0.8,1,0,1,b,usb,1.00,,,fast,rows+"),
+        (Answer.of, "7,1.0,ok,wood,nan,0.8,1,0,1,b,usb,1.00,"),
+        (Answer.of, "7,1.0,ok,wood,0.9,0.8,1,0,inf,b,usb,1.00,"),
+        (Answer.of, "7,1.0,ok,wood,0.9,0.8,1,0,1,b,usb,1.00,,,nan,rows+"),
         (Answer.of_finger, "left"),
         (BoxState.of, "1,streaming"),
         (BoxIdentity.of, "mine,2"),
     ],
 )
 def test_a_sentence_of_another_form_is_named(read, fields):
-    """Too few fields, an unknown status, a word for a number."""
+    """Too few fields, an unknown status, a word or NaN for a number."""
     with pytest.raises(FormatError, match="older") as e:
         read(fields.split(","))
     assert fields.removeprefix("left") in str(e.value)

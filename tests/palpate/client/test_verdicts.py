@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ import pytest
 from palpate.bridges.memory import MemoryBridge
 from palpate.cli.main import main
 from palpate.client.feed import Feed
-from palpate.client.verdicts import DAY_S, DAYS, VerdictFile, counts, since
+from palpate.client.verdicts import AHEAD_S, DAY_S, DAYS, EVERY, OLD, VerdictFile, counts, since
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FeedError, TemporaryError
 from tests.factories import feed_lines
@@ -109,6 +110,75 @@ def test_a_damaged_file_is_moved_aside(path, caplog):
     assert len([*since(path, 0)]) == 1
     assert path.with_suffix(".damaged").stat().st_size == 8192
     assert "damaged" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        "CREATE TABLE verdicts (number INTEGER PRIMARY KEY, at REAL, sweep INTEGER, colour TEXT)",
+        "CREATE TABLE verdicts (x)",
+        "CREATE VIEW verdicts AS SELECT 1",
+    ],
+)
+def test_a_file_of_another_version_is_moved_aside(path, made):
+    """Its verdicts are kept; new ones are written."""
+    with closing(sqlite3.connect(path)) as db:
+        db.execute(made)
+        db.commit()
+    file = VerdictFile(path)
+    file.add(NOW, verdict(1))
+    file.close()
+    assert [row["sweep"] for row in since(path, 0)] == [1]
+    with closing(sqlite3.connect(path.with_suffix(".damaged"))) as db:
+        assert db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] >= 1
+
+
+@pytest.mark.parametrize("how", ["damaged", "moved", "deleted"])
+def test_a_file_that_is_spoilt_while_it_is_written(path, how):
+    """What comes later is written to a new file."""
+    file = VerdictFile(path)
+    file.add(NOW, verdict(1))
+    file.db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    file.db.execute("PRAGMA shrink_memory")
+    if how == "damaged":
+        head = path.read_bytes()[:4096]
+        path.write_bytes(head + bytes(range(256)) * ((path.stat().st_size - len(head)) // 256))
+    else:
+        path.rename(path.with_name("old.db")) if how == "moved" else path.unlink()
+    for sweep in (2, 3):
+        file.add(NOW, verdict(sweep))
+    file.close()
+    assert [row["sweep"] for row in since(path, 0)] == [2, 3]
+
+
+def test_a_clock_that_is_wrong_for_a_while(path):
+    """Half a year ahead it deletes few verdicts; those of then are in no period of now."""
+    file = VerdictFile(path)
+    for n in range(3 * OLD):
+        file.add(NOW + n, verdict(n))
+    for n in range(EVERY):
+        file.add(NOW + 180 * DAY_S + n, verdict(n, "unknown", ""))
+    file.close()
+    found = counts(path, NOW, NOW + AHEAD_S)
+    assert found[("ok", "wood")] >= 2 * OLD
+    assert [*found] == [("ok", "wood")]
+
+
+def test_a_disk_that_is_full_when_old_verdicts_are_deleted(path, monkeypatch):
+    """The verdict of then is there once; they are deleted later."""
+    file, calls = VerdictFile(path), []
+
+    def trim(now_s: float) -> None:
+        calls.append(now_s)
+        if len(calls) < 3:
+            raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(file, "trim", trim)
+    for n in range(EVERY + 5):
+        file.add(NOW + n, verdict(n))
+    file.close()
+    assert [row["sweep"] for row in since(path, 0)] == [*range(EVERY + 5)]
+    assert len(calls) == 3
 
 
 @pytest.mark.parametrize("value", ["high", np.float32(0.9), np.bool_(True), b"1"])

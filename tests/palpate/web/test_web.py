@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from palpate.client.verdicts import VerdictFile
 from palpate.core.clock import SystemClock
+from palpate.core.errors import FormatError
 from palpate.web.access import Access
 from palpate.web.history import History
 from palpate.web.web import FRAMES_HZ, PageWatcher
@@ -81,6 +83,36 @@ def test_what_the_box_does_comes_to_the_page(watcher, path):
     assert (picture["sweep"], picture["seconds"]) == (7, 2.0)
     offered.feed.frames(frames())
     assert heard(watcher, offered, "view", reader)["shape"] == [4, 4]
+
+
+@pytest.mark.parametrize("content", [b"", b"no file of SQLite" * 500])
+def test_a_file_of_verdicts_that_cannot_be_read(watcher, path, content):
+    """Counts and CSV file say why."""
+    path.with_name("verdicts.db").write_bytes(content)
+    answers = [ask(watcher.server, f"/{name}/1") for name in ("history", "verdicts")]
+    assert [status(answer) for answer in answers] == [200, 503]
+    for answer in answers:
+        assert b"verdicts.db" in answer
+
+
+@pytest.mark.parametrize("wrong", [{"time_ns": "1"}, {"label": None}, {"sweep": [1]}])
+def test_a_verdict_of_another_version_does_not_end_the_page(watcher, wrong):
+    """It is refused as other lines of the feed are."""
+    with pytest.raises(FormatError, match="version"):
+        watcher.history.take(feed_lines.verdict(1, 1.0) | wrong, SystemClock().now_ns())
+
+
+def test_verdicts_of_a_clock_that_was_wrong(watcher, path):
+    """Years ahead they are in no count, picture or CSV file of now; an hour ahead they are."""
+    file = VerdictFile(path.with_name("verdicts.db"))
+    for sweep, ahead_s in ((1, 0), (2, 3600), (3, 5e8), (4, 1e300)):
+        file.add(time.time() + ahead_s, {"sweep": sweep, "status": "ok", "label": "wood"})
+    file.close()
+    counted = watcher.history.counted("0")
+    assert counted["counts"] == [["ok", "wood", 2]]
+    spans = (counted["to_s"] - counted["from_s"]) / counted["span_s"]
+    assert all(0 <= n <= spans for n, *_ in counted["trend"])
+    assert len("".join(watcher.history.rows("0")).splitlines()) == 3
 
 
 def test_frames_are_asked_for_while_somebody_watches(watcher, path):
