@@ -109,16 +109,15 @@ class OpcuaBridge:
 
     async def open(self, host: str, port: int) -> None:
         """Make the nodes and listen. Raises AddressError or ConfigError as TcpServer does."""
-        server, uri = self._server, f"{URI}:{self._offer.name}"
-        certificate, key = own_certificate(self._offer.folder, uri, host)
+        server, offer = self._server, self._offer
+        certificate, key, uri = own_certificate(offer.folder, f"{URI}:{offer.name}", host)
         await server.init()
         await server.set_application_uri(uri)
-        server.set_server_name(f"Palpate {self._offer.name}")
-        about = "Palpate", f"Palpate {self._offer.name}", __version__, ""
+        server.set_server_name(f"Palpate {offer.name}")
+        about = "Palpate", f"Palpate {offer.name}", __version__, ""
         await server.set_build_info(URI, *about, wall_clock.utc())
         await server.load_certificate(certificate, "der")
         await server.load_private_key(key, format="pem")
-        offer = self._offer
         limit(server, offer.most, users=self._users, anonymous=offer.anonymous)
         await self._add_variables(await server.register_namespace(URI))
         await self._add_methods(await server.get_namespace_index(URI))
@@ -264,11 +263,12 @@ class OpcuaBridge:
 
     async def _get_results(self, parent: Any, *given: ua.Variant) -> Any:
         """The method GetResults: results since a time as JSON, oldest first."""
-        if len(given) != 2 or given[0].VariantType is not KINDS.DateTime:
+        since = given[0] if len(given) == 2 else ua.Variant()
+        if since.VariantType is not KINDS.DateTime or since.is_array or not since.Value:
             return ua.StatusCode(CODES.BadInvalidArgument)
         most = numbers(given[1:], {"Most": 2**32})
         if isinstance(most, ua.CallMethodResult):
             return most
-        from_s, wanted = wall_clock.seconds_of(given[0].Value), min(round(most[0]) or MOST, MOST)
+        from_s, wanted = wall_clock.seconds_of(since.Value), min(round(most[0]) or MOST, MOST)
         rows = await asyncio.to_thread(self._results.since, from_s, wanted)
         return [ua.Variant([json.dumps(row) for row in rows], KINDS.String, is_array=True)]

@@ -21,13 +21,14 @@ from asyncua.crypto import cert_gen
 from asyncua.crypto.permission_rules import USER_TYPES, SimpleRoleRuleset, User, UserRole
 from asyncua.server import binary_server_asyncio
 from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.errors import ConfigError
 from palpate.core.log import SparseLog
+from palpate.core.text import printable
 
 KEPT = 1000
 """Values that wait for a subscriber."""
@@ -106,9 +107,10 @@ class Login:
         return None
 
 
-def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes]:
-    """Certificate (DER) and private key (PEM) of this server in `folder`, made at its first start.
-    host: where it listens. Raises ConfigError."""
+def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes, str]:
+    """Certificate (DER), private key (PEM) and URI of this server in `folder`, made at its first
+    start for `uri`; the URI of a box with another name since then stays, for clients compare it
+    with the certificate. host: where it listens. Raises ConfigError."""
     certificate, key = folder / "certificate.der", folder / "key.pem"
     try:
         if not (certificate.exists() and key.exists()):
@@ -123,11 +125,28 @@ def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes]:
             folder.mkdir(parents=True, exist_ok=True)
             storage.put(key, cert_gen.dump_private_key_as_pem(secret), mode=0o600)
             storage.put(certificate, made.public_bytes(Encoding.DER), mode=0o644)
-        return certificate.read_bytes(), key.read_bytes()
+        both = certificate.read_bytes(), key.read_bytes()
+        return *both, _uri(*both) or uri
+    except ValueError as e:
+        raise ConfigError(
+            f"{certificate} and {key.name} are no pair ({printable(str(e))[:60]}); delete both: new"
+            " ones are made, and clients have to trust them"
+        ) from e
     except OSError as e:
         raise ConfigError(
             f"{folder}: {str(e.strerror).lower()}; name a folder of your own with --folder"
         ) from e
+
+
+def _uri(certificate: bytes, key: bytes) -> str:
+    """The URI of a certificate, "" for none. Raises ValueError if the key is of another one."""
+    made = x509.load_der_x509_certificate(certificate)
+    if load_pem_private_key(key, None).public_key() != made.public_key():
+        raise ValueError("the key is of another certificate")
+    with suppress(x509.ExtensionNotFound):
+        names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
+    return ""
 
 
 def limit(server: Server, most: int, *, users: bool, anonymous: bool) -> None:

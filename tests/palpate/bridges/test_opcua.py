@@ -163,8 +163,9 @@ def test_results_of_a_client_that_was_away(box, folder):
         later = datetime.fromtimestamp(found[-1]["at"], UTC)
         rest = results(ua.Variant(later, ua.VariantType.DateTime), 0)
         assert [each["sweep"] for each in rest][-2:] == [6, 7]
-        for given in ((1, 5), (since, "x"), (since,)):
-            with pytest.raises(ua.UaStatusCodeError):
+        dates = ua.Variant([before, before], ua.VariantType.DateTime)
+        for given in ((1, 5), (since, "x"), (dates, 5)):
+            with pytest.raises(ua.uaerrors.BadInvalidArgument):
                 results(*given)
 
 
@@ -285,10 +286,24 @@ def test_without_a_login_it_does_not_start(box, tmp_path):
 
 
 def test_the_certificate_is_made_once(tmp_path):
-    """The second start has the first one's; others cannot read the key."""
+    """The second start has the first one's, also of a box with a new name: clients compare the URI
+    with the certificate. Others cannot read the key."""
     first = opcua_security.own_certificate(tmp_path / "a", "urn:x", "192.168.0.10")
-    assert opcua_security.own_certificate(tmp_path / "a", "urn:x", "192.168.0.10") == first
+    assert opcua_security.own_certificate(tmp_path / "a", "urn:y", "192.168.0.11") == first
+    assert first[2] == "urn:x"
     assert (tmp_path / "a" / "key.pem").stat().st_mode & 0o077 == 0
     (tmp_path / "b").touch()
     with pytest.raises(ConfigError, match="--folder"):
         opcua_security.own_certificate(tmp_path / "b", "urn:x", "::")
+
+
+@pytest.mark.parametrize("wrong", ["certificate.der", "key.pem", "other key.pem"])
+def test_a_certificate_and_a_key_that_are_no_pair(tmp_path, wrong):
+    """Of a copy that was cut short, or of two boxes: refused with what to do."""
+    for name in ("a", "b"):
+        opcua_security.own_certificate(tmp_path / name, "urn:x", "127.0.0.1")
+    other, _, name = wrong.rpartition(" ")
+    text = (tmp_path / "b" / name).read_bytes()
+    (tmp_path / "a" / name).write_bytes(text if other else text[:50])
+    with pytest.raises(ConfigError, match="delete both"):
+        opcua_security.own_certificate(tmp_path / "a", "urn:x", "127.0.0.1")
