@@ -129,8 +129,8 @@ def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes, st
         return *both, _uri(*both) or uri
     except ValueError as e:
         raise ConfigError(
-            f"{certificate} and {key.name} are no pair ({printable(str(e))[:60]}); delete both: new"
-            " ones are made, and clients have to trust them"
+            f"{certificate} and {key.name} are no pair ({printable(str(e))[:60]}); delete both, and"
+            " trust the new certificate in the clients"
         ) from e
     except OSError as e:
         raise ConfigError(
@@ -139,7 +139,7 @@ def own_certificate(folder: Path, uri: str, host: str) -> tuple[bytes, bytes, st
 
 
 def _uri(certificate: bytes, key: bytes) -> str:
-    """The URI of a certificate, "" for none. Raises ValueError if the key is of another one."""
+    """The URI of a certificate, "" for none. Raises ValueError if the key does not fit."""
     made = x509.load_der_x509_certificate(certificate)
     if load_pem_private_key(key, None).public_key() != made.public_key():
         raise ValueError("the key is of another certificate")

@@ -101,7 +101,7 @@ class VerdictFile:
             self.db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
 
     def _anew(self, why: sqlite3.DatabaseError) -> sqlite3.Connection:
-        """A new file in place of one that cannot be used. Raises sqlite3.DatabaseError."""
+        """Keep the file under another name, and open a new file. Raises sqlite3.DatabaseError."""
         path = self._path
         if path is None:
             raise why
