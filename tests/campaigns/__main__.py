@@ -198,7 +198,7 @@ CAMPAIGNS = {
         *("tests.robots.side_by_side", "--minutes", "5"),
     ),
     "taught": _module(
-        "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
+        "judge taught bundles at 5, 10 and 20 sweeps (half an hour)",
         "tests.campaigns.taught",
     ),
     "unknown-materials": _module(

@@ -4,6 +4,10 @@
 seed: the share of other recordings that the taught bundle classifies correctly and calls unknown.
 Taxels that may be bridged are not measured. Fabrics need PALPATE_DATA.
 
+With `--junk` the sweeps are of places where nobody taught, and the line tells the shares of junk
+and of altered slides that get a wrong label, whole and early (in the simulator the kinds of the
+campaign `junk`; of recorded sweeps the kinds of palpate_train.data.junk, and altered copies).
+
 With `--added N` each material in turn comes later, with N sweeps: into a bundle of the others that
 stays, as the box teaches it, and into a fit of all materials.
 """
@@ -31,6 +35,7 @@ from palpate_train.export import quantized_bundle
 from palpate_train.metrics import bundle_score
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
+from tests.campaigns import taught_junk
 
 Array = NDArray[np.bool_]
 SETS = ("sim:T-REAL:1:10", "sim:T-REAL/level-blind:1:10", "fabricslide/fabricslide.npz")
@@ -45,10 +50,14 @@ def main() -> None:
     parser.add_argument("--each", nargs="+", type=int, default=(5, 10, 20))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--added", type=int, help="sweeps of a material that comes later")
+    parser.add_argument("--junk", action="store_true", help="junk and altered slides, too")
     args = parser.parse_args()
     for name in args.sets:
         known = name.startswith("sim:") or Path(name).exists()
         path = name if known else str(Path(os.environ["PALPATE_DATA"]) / name)
+        if args.junk:
+            taught_junk.run(name, path, args.each, args.seeds)
+            continue
         sweeps = sets.load(path)
         for each in args.each:
             for seed in range(args.seeds):

@@ -56,6 +56,23 @@ def test_untrained_features_are_kept_and_come_back():
     assert (embedding.embed(x, y, 18).untrained == np.eye(20)).all()
 
 
+@pytest.mark.parametrize("fixed", [0, 2])
+def test_directions_towards_other_things_count(fixed: int):
+    """What differs from all materials in another direction is far away; materials are not, and a
+    model without one of them looks there, too."""
+    x, y = gaussians(60, 6 * np.eye(3, 12))
+    other = np.full(12, 0.0)
+    other[4] = 20
+    plain = embedding.in_two_views(x, y, fixed)
+    one = embedding.in_two_views(x, y, fixed, other[None])
+    assert plain.novelty(other[None])[0] < 150 < 300 < one.novelty(other[None])[0]
+    assert np.quantile(one.novelty(x), 0.9) < 2 * np.quantile(plain.novelty(x), 0.9)
+    assert one.beyond.shape == (len(one.offset), 1)
+    without = embedding.shapes_without(one, one(x), y)(0)
+    away = one(other[None])[:, None] - one.means[1:]
+    assert embedding.shaped_distances(away, without).min() > 300
+
+
 def test_each_material_has_its_own_shape_in_untrained_features():
     """Far from a material that hardly varies, whatever others do; few sweeps share a shape."""
     x, y = gaussians(400, [[0, 0, 0], [60, 0, 0]])

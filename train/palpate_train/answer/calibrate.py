@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,8 +27,10 @@ from palpate.answer.unknown import (
 )
 from palpate_train.answer import fit_displacement, fit_early
 from palpate_train.answer.embedding import (
+    NOTHING,
     Embedding,
     cross_fitted,
+    embed,
     in_two_views,
     parts,
     shapes_without,
@@ -224,6 +226,13 @@ class CalibrationInputs:
         """Features [N, F] of the whole window."""
         return self.prefixes[:, -1]
 
+    @property
+    def beyond(self) -> Array:
+        """Mean features [J, F] of every second window of each kind of junk."""
+        if not self.junk:
+            return NOTHING
+        return np.stack([windows[::2].mean(axis=0) for windows in self.junk.values()])
+
     @cached_property
     def head_data(self) -> HeadData:
         """All sweeps, and the copies that heads are fitted to."""
@@ -250,7 +259,8 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     groups = given.groups[numbers]
     temperatures = fit_early.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
-    embedding, last = in_two_views(whole, labels, given.fixed), float(temperatures[-1])
+    embedding = in_two_views(whole, labels, given.fixed, given.beyond)
+    last = float(temperatures[-1])
     steps = fit_early.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
     distances = left_out_in_turn(given, embedding)
     beyond = limits(distances, junk=junk_distances(given, embedding))
@@ -282,7 +292,8 @@ def left_out(
     x, labels = given.whole, given.labels
     known, strangers, of_finished = (np.full(len(labels), np.nan) for _ in range(3))
     parts = 0
-    for seen, numbers, embedding, present in cross_fitted(x, labels, values, judged, given.fixed):
+    fitted = cross_fitted(x, labels, values, judged, given.fixed, given.beyond)
+    for seen, numbers, embedding, present in fitted:
         shapes, without = view(seen, embedding, present)
         z, means = embedding(x[numbers]), embedding.means.astype(np.float64)
         known[numbers] = shaped_distances(z[:, None] - means, shapes).min(axis=1)
@@ -314,8 +325,9 @@ def left_out_in_turn(given: CalibrationInputs, finished: Embedding) -> dict[str,
 
 
 def junk_distances(given: CalibrationInputs, finished: Embedding) -> dict[str, Array]:
-    """Distances of junk, by kind, to the nearest mean of the finished model."""
-    return {kind: finished.novelty(features) for kind, features in given.junk.items()}
+    """Distances of the junk that `beyond` does not show, by kind, to the nearest mean of the
+    finished model."""
+    return {kind: finished.novelty(features[1::2]) for kind, features in given.junk.items()}
 
 
 def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
@@ -355,8 +367,9 @@ def _displacement(
     copied = given.copied
     if not copied.held.any():
         return None
+    embedded = partial(embed, fixed=given.fixed, beyond=given.beyond)
     weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.held]))
     logits = (copied.features[copied.held] @ weight + bias) / temperature
     return fit_displacement.fit(
-        given.whole, given.labels, given.groups, given.held, given.fixed, copied, logits, kept
+        given.whole, given.labels, given.groups, given.held, embedded, copied, logits, kept
     )

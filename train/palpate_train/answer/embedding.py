@@ -30,6 +30,7 @@ PARTS = 10
 FEW_SHARE = 1.5
 """Least shrinkage of the scatter of n sweeps of a material, times n - 1. By Ledoit and Wolf's
 formula two sweeps have no noise, so without this every new sweep would lie infinitely far away."""
+NOTHING = np.empty((0, 0))
 FLAT = 1e-9
 """Least variance of a direction, relative to that of the widest direction: a silent channel stays
 finite."""
@@ -73,6 +74,13 @@ class Embedding:
         """[r, b], multiplies differences of z to give differences of the features that `turn` takes
         as they are; the identity if it takes none."""
         return untrained(self.turn if self.selected else None, len(self.offset), self.selected)
+
+    @property
+    def beyond(self) -> Array:
+        """Orthonormal directions [r, J] towards things that are of no material."""
+        r, trained = len(self.offset), len(self.means) - 1
+        every = self.shapes.shape[1] and not self.selected
+        return np.eye(r)[:, trained : trained if every else r - self.selected]
 
     def __call__(self, features: Array) -> Array:
         """Features [..., F] -> z, float64 [..., r]."""
@@ -122,14 +130,15 @@ def untrained(turn: Array | None, r: int, selected: int) -> Array:
     return view
 
 
-def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+def embed(features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHING) -> Embedding:
     """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 +
-    fixed, F) directions.
+    J + fixed, F) directions. beyond: mean features [J, F] of things that are of no material.
 
     The covariance is Ledoit and Wolf's, as in heads.fit_discriminant. The first K - 1
-    directions hold everything that LDA uses. More are added until they contain the last `fixed`
-    features, which were not trained (see spectrum.py): trained materials do not differ there, but
-    an unknown one may. In these directions each material has its own shape.
+    directions hold everything that LDA uses. The next J lead from the materials to `beyond`. More
+    are added until they contain the last `fixed` features, which were not trained (see
+    spectrum.py): trained materials do not differ there, but an unknown one may. In these directions
+    each material has its own shape.
 
     Raises FormatError if there is one material, if a label is missing, or if each material has only
     one sweep.
@@ -152,8 +161,12 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][
         : classes - 1
     ].T
+    if (room := min(len(beyond), size - fixed - classes)) > 0:
+        others = white.transposed(beyond - middle - means.mean(axis=0))
+        others -= others @ axes @ axes.T
+        axes = np.hstack([axes, np.linalg.svd(others, full_matrices=False)[2][:room].T])
     orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
-    if fixed and classes - 1 + fixed < size:  # W times columns of its inverse selects features
+    if fixed and axes.shape[1] + fixed < size:  # W times columns of its inverse selects features
         directions, turn = white.apply(axes), np.linalg.inv(mixed)
     else:
         directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
@@ -170,24 +183,28 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     )
 
 
-def in_two_views(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+def in_two_views(
+    features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHING
+) -> Embedding:
     """As `embed`, with distances that are the sum of two: in the features that were not trained,
-    and in the directions in which the means differ. Which of them shows an unknown material depends
-    on the skin (docs/decisions/0005). In both, each material has its own scatter, and the sweeps
-    lie at r from their mean on average. Without untrained features it is `embed`."""
-    z = embed(features, labels, fixed)
+    and in the directions in which the means differ, or `beyond` from them. Which of them shows an
+    unknown material depends on the skin (docs/decisions/0005). In both, each material has its own
+    scatter, and the sweeps lie at r from their mean on average. Without untrained features it is
+    `embed`."""
+    z = embed(features, labels, fixed, beyond)
     if not z.shapes.shape[1]:
         return z
     away = z(features) - z.means[labels]
     each = [away[labels == k] for k in range(len(z.means))]
-    return replace(z, shapes=_in_both(each, z.means, z.untrained).astype(np.float16))
+    return replace(z, shapes=_in_both(each, z.means, z).astype(np.float16))
 
 
-def _in_both(each: Sequence[Array], means: Array, untrained: Array) -> Array:
+def _in_both(each: Sequence[Array], means: Array, of: Embedding) -> Array:
     """The shapes [K, r, r] of `in_two_views` for differences from the means [K, r], [n, r] of each
     material."""
     own = np.stack([own_scatter(sweeps) for sweeps in each])
-    shapes = shapes_of(within(own, untrained) + within(own, differing(means)))
+    trained = np.hstack([differing(means), of.beyond])
+    shapes = shapes_of(within(own, of.untrained) + within(own, trained))
     total = sum(float(((x @ w) ** 2).sum()) for x, w in zip(each, shapes, strict=True))
     scaled: Array = np.sqrt(sum(x.size for x in each) / max(total, FLAT)) * shapes
     return scaled
@@ -203,8 +220,8 @@ def shapes_without(embedding: Embedding, z: Array, labels: Array) -> Callable[[i
         others = np.delete(means, k, axis=0)
         if embedding.shapes.shape[1]:
             rest = [of for number, of in enumerate(each) if number != k]
-            return _in_both(rest, others, embedding.untrained)
-        view = differing(others)
+            return _in_both(rest, others, embedding)
+        view = np.hstack([differing(others), embedding.beyond])
         return np.broadcast_to(view @ view.T, (len(others), *view.T.shape[1:] * 2))
 
     return without
@@ -249,11 +266,13 @@ def _shape(away: Array) -> Array:
     return shape
 
 
-def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
+def embed_present(
+    features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHING
+) -> tuple[Embedding, Array]:
     """The Embedding of sweeps that may lack some labels, in two views, and the labels [K] of its
     means."""
     present, numbered = np.unique(labels, return_inverse=True)
-    return in_two_views(features, numbered, fixed), present
+    return in_two_views(features, numbered, fixed, beyond), present
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,12 +360,17 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
 
 
 def cross_fitted(
-    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+    features: Array,
+    labels: Array,
+    groups: Array,
+    judged: Array,
+    fixed: int = 0,
+    beyond: Array = NOTHING,
 ) -> Iterator[tuple[Array, Array, Embedding, Array]]:
     """For each of `parts` the pair that it yields, the embedding of the sweeps to fit to, and the
     labels [K] of its means. Sweeps of a material that occurs in no other part do not judge."""
     for fit, numbers in parts(groups, judged):
-        embedding, present = embed_present(features[fit], labels[fit], fixed)
+        embedding, present = embed_present(features[fit], labels[fit], fixed, beyond)
         yield fit, numbers[np.isin(labels[numbers], present)], embedding, present
 
 

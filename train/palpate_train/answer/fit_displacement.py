@@ -8,7 +8,7 @@ copies of held-out sweeps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -82,7 +82,7 @@ def fit(
     labels: Array,
     groups: Array,
     held: Array,
-    fixed: int,
+    embedded: Callable[[Array, Array], Embedding],
     copied: AugmentedCopies,
     logits: Array,
     kept: float = embedding.KEPT,
@@ -90,9 +90,9 @@ def fit(
     """The rule for displaced sweeps; None without copies to fit it to and to judge it by.
 
     whole, labels, groups, held: features [N, F], int [N], int [N] and bool [N] as in
-    CalibrationInputs. logits: [m, K] of the held-out copies, calibrated for contacts that are in
-    place, by a head that saw none of their groups. kept: share of the held-out copies within the
-    limit of known materials.
+    CalibrationInputs. embedded: embeds features with their labels. logits: [m, K] of the held-out
+    copies, calibrated for contacts that are in place, by a head that saw none of their groups.
+    kept: share of the held-out copies within the limit of known materials.
     """
     fitted, judging = copied.take(~copied.held), copied.take(copied.held)
     if (
@@ -104,7 +104,7 @@ def fit(
     def turn(by: Array) -> tuple[Embedding, Embedding]:
         """An embedding of the sweeps `by` (bool [N]), and an embedding of the copies after the
         first."""
-        z = embed(whole[by], labels[by], fixed)
+        z = embedded(whole[by], labels[by])
         return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
 
     across, judge = turn(~held)

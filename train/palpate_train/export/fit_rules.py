@@ -60,7 +60,8 @@ def from_features(
     prefixes = fit.trunk(prefixes=True) if rule.early else None
     given = fit.given or calibration_inputs(fit)
     apart = _unseen(given, calibration)
-    found = _widened(fit, apart.embedding, calibration.embedding)
+    few = given.junk or altered_sweeps.few(fit.held)
+    found = None if few else _widened(fit, apart.embedding, calibration.embedding)
     classes = [apart.classes(), calibration.classes()]
     beyond = _limits(found, given, calibration.embedding, fit)
     early = {"lost": rule.lost, "n": rule.n} if rule.early else rule.why
@@ -115,8 +116,6 @@ def _limits(
 def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:
     """Shapes of known materials that know how altered sweeps differ. apart: an embedding that did
     not see the held-out sweeps."""
-    if altered_sweeps.few(fit.held):
-        return None
     trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
     return altered_sweeps.measure(
@@ -136,7 +135,9 @@ def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
     weight, bias = given.naming_head(seen)
     return replace(
         calibration,
-        embedding=embedding.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
+        embedding=embedding.in_two_views(
+            given.whole[seen], given.labels[seen], given.fixed, given.beyond
+        ),
         weight=weight / calibration.temperature,
         bias=bias / calibration.temperature,
     )

@@ -44,7 +44,7 @@ WHAT = "a fit (made by palpate-train fit)"
 HELD_COPIES_SEED, FAULTS_SEED, JUNK_SEED = 1, 2, 3
 """Added to a fit's seed for the copies of its held-out sweeps, for the copies with faults, and for
 junk."""
-JUNK_EACH, MOST_BY_JUNK = 12, 10
+JUNK_EACH, MOST_BY_JUNK = 24, 10
 """Windows of each kind of junk that help to find the limits of known materials, and the largest
 number of sweeps of a material that need them. More sweeps show by themselves where unknown
 materials lie, and junk would only make the limit narrower for known ones."""
