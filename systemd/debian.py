@@ -188,7 +188,7 @@ if [ "$1" = remove ]; then
   for one in {own}; do
     if [ -L "$one" ]; then rm -f "$one"; fi
   done
-  rm -rf {LINK} {LINK}-* {LINK}.previous {LINK}.trial {LINK}.rejected
+  rm -rf {LINK} {LINK}-* {LINK}.previous {LINK}.trial* {LINK}.rejected
   [ ! -d /run/systemd/system ] || systemctl daemon-reload
   echo "palpate: sweeps and bundles stay in /var/lib/palpate, settings in /etc/palpate"
 elif [ "$1" = purge ]; then

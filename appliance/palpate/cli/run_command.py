@@ -81,14 +81,36 @@ def _classify(
             "unsigned": lambda: unsigned,
         }
         reports = _reports(settings, current, devices.source, facts, stack, disk)
+        if release and settings.store.runtime_folder:
+            reports += _compared(release, settings, choice, current, stack, disk)
         observers = [
             o for o in (disk, Notifier(SystemClock()), trial, release, shadow, *reports) if o
         ]
         recorded = capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack
         box = assembly.box(*parts, capture=recorded, observers=observers)
-        box.run(done(args.sweeps, box, devices, stopped))
+        ended = done(args.sweeps, box, devices, stopped)
+        box.run(lambda: ended() or bool(release and release.over))
     return stopped.exit_code
+
+
+def _compared(
+    release: ReleaseTrial,
+    settings: Config,
+    choice: Choice | None,
+    current: Bundle,
+    stack: ExitStack,
+    disk: DiskThread,
+) -> list[Observer]:
+    """Keeps the latest sweeps in memory, and compares them with the answers of the proven
+    release."""
+    from palpate.sweeps.black_box import BlackBox
+
+    folder = Path(settings.store.runtime) / "trial"
+    of = choice.folder if choice else Path(settings.classifier.bundle)
+    kept = BlackBox(folder, current.format, release_trial.KEPT, disk)
+    stack.callback(kept.close)
+    return [kept, release_trial.comparison(release, folder, of)]
 
 
 def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:

@@ -1,26 +1,45 @@
 """Observes the trial of a release, as that of a bundle, in the service; root's part is in
-`releases`."""
+`releases`.
+
+In the trial the proven release answers the latest sweeps, too (Comparison). A sweep on which the
+new release fails, or which it answers otherwise with the same bundle, ends the program between two
+sweeps, and root sends the release back before the next start.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from palpate.core.log import log
+from palpate.core.observer import Observer
 from palpate.core.status import Status
 from palpate.deployment import releases
 from palpate.deployment.state import Goal, Standing
 from palpate.deployment.trial import Trial
 
 if TYPE_CHECKING:
+    from palpate.core.health import Health
     from palpate.core.types import Verdict
     from palpate.deployment.releases import ReleaseReport
     from palpate.deployment.state import TrialProgress
 
 GOAL = Goal(50, 24 * 3600.0, both=True)
 """A release is proven after 50 sweeps with a label and 24 hours in which the skin streamed."""
+
+KEPT, EVERY = 50, 10
+"""Sweeps of a start that are compared, and new ones for each comparison. A release 3 points worse
+answers 6 % of sweeps otherwise, so 50 show it 19 times of 20."""
+COMPARED_S = 60.0
+"""Time for a comparison, which goes on beside the loop at the lowest priority."""
+OTHERWISE = 3
+"""Exit code of palpate.runtime.replay if answers differ."""
 
 
 class ReportStore:
@@ -52,16 +71,82 @@ class ReportStore:
 
 
 class ReleaseTrial(Trial):
-    """The trial of the release that this program belongs to. A sweep on which it failed sends the
-    release back at the next start."""
+    """The trial of the release that this program belongs to. proven: the Python of the release to
+    go back to. over: whether the program must end, so that the release goes back."""
 
     _store: ReportStore
+    proven = ""
+    over = False
+
+    def goes_back(self, why: str) -> None:
+        """The release has failed."""
+        log.error(f"{self._title} goes back: {why}")
+        self._store.failed(why)
+        self.over = os.path.exists(self.proven)
 
     def answered(self, verdict: Verdict) -> None:
         """As for a bundle."""
         super().answered(verdict)
         if verdict.status is Status.FAILED:
-            self._store.failed(f"sweep {verdict.sweep} was not answered: {verdict.detail}")
+            self.goes_back(f"sweep {verdict.sweep} was not answered: {verdict.detail}")
+
+
+class Comparison(Observer):
+    """The proven release answers the sweeps in a folder again. command: does that, and says what
+    differs. differs: is told it."""
+
+    def __init__(self, command: Sequence[str], differs: Callable[[str], object]) -> None:
+        self._command, self._differs = command, differs
+        self._sweeps = self._compared = 0
+        self._end_ns = 0
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def answered(self, verdict: Verdict) -> None:
+        """Count the sweep."""
+        self._sweeps += 1
+
+    def turn(self, health: Health) -> None:
+        """Begin a comparison, or look for its end."""
+        if self._process:
+            self._look(self._process, health.time_ns)
+        elif not health.sweeping and self._compared < min(KEPT, self._sweeps - EVERY + 1):
+            self._compared += EVERY
+            self._begin(health.time_ns)
+
+    def _begin(self, now_ns: int) -> None:
+        with suppress(OSError):  # without the proven release nothing is compared
+            self._process = subprocess.Popen(
+                self._command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            )
+            self._end_ns = now_ns + round(COMPARED_S * 1e9)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, 19)
+
+    def _look(self, process: subprocess.Popen[bytes], now_ns: int) -> None:
+        if (code := process.poll()) is None and now_ns < self._end_ns:
+            return
+        said = self._ended(process)
+        if code == OTHERWISE:
+            self._differs(said)
+
+    def _ended(self, process: subprocess.Popen[bytes]) -> str:
+        """What it said, at most a pipe's content."""
+        process.kill()
+        process.wait()
+        self._process = None
+        assert process.stdout
+        with process.stdout as out:
+            return out.read().decode(errors="replace").strip()
+
+    def stopping(self) -> None:
+        """End a comparison that runs."""
+        if self._process:
+            self._ended(self._process)
+
+
+def comparison(trial: ReleaseTrial, kept: Path, bundle: Path) -> Comparison:
+    """Compares the sweeps in the folder `kept`, which were answered by the bundle in a folder."""
+    words = [trial.proven, "-I", "-m", "palpate.runtime.replay", str(kept), str(bundle)]
+    return Comparison(words, trial.goes_back)
 
 
 def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:
@@ -79,4 +164,6 @@ def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:
     )
     standing = Standing(sweeps=sweeps, streamed_s=s)
     store = ReportStore(folder, begun)
-    return ReleaseTrial(store, trial.release, f"release {trial.release}", standing)
+    made = ReleaseTrial(store, trial.release, f"release {trial.release}", standing)
+    made.proven = str(Path(sys.prefix).resolve().parent / trial.back / "bin" / "python")
+    return made

@@ -3,9 +3,11 @@
 A release is a folder, /opt/palpate-VERSION; /opt/palpate leads to the present release, and
 /opt/palpate.previous to the proven one. While a release is on trial, /opt/palpate.trial holds the
 part of root (RootState). Before each start of the service, root runs `begin` with the program of
-the proven release: it counts the start, or sends the new release back. The service records its part
-(ReleaseReport) where user palpate may write. /opt/palpate.rejected lists the releases that were
-sent back; they are refused until somebody removes that file.
+the proven release: it counts the start, or sends the new release back. The service records its
+part (ReleaseReport) where user palpate may write. For each finger of a hand (palpate@NAME) root
+counts in /opt/palpate.trial-NAME; any finger can send the release back, and the first that reaches
+the goal proves it. /opt/palpate.rejected lists the releases that were sent back; they are refused
+until somebody removes that file.
 
 Each step is one rename, and the steps come in this order: `activate` writes the trial, then the
 link; `send back` writes the rejection, then the link, then removes the trial. So after a loss of
@@ -109,8 +111,10 @@ class Releases:
         self, folder: Path = FOLDER, report: Path | None = None, boot: Path = BOOT
     ) -> None:
         self.folder, self._report, self._boot = folder, report, boot
+        unit = report.name.partition(f"{NAME}-")[2] if report else ""
         self._link, self._previous = folder / NAME, folder / f"{NAME}.previous"
         self._trial, self._rejected = folder / f"{NAME}.trial", folder / f"{NAME}.rejected"
+        self._counts = folder / f"{NAME}.trial-{unit}" if unit else self._trial
 
     @property
     def current(self) -> str:
@@ -120,11 +124,10 @@ class Releases:
     @property
     def trial(self) -> RootState | None:
         """The trial of the current release; None for one that is proven."""
-        try:
-            held: RootState = typed(RootState, json.loads(self._trial.read_bytes()))
-        except (OSError, ValueError, TypeError):
+        held, counted = _state(self._trial), _state(self._counts)
+        if not held or held.release != self.current:
             return None
-        return held if held.release == self.current else None
+        return counted if counted and counted.id == held.id else held
 
     @property
     def rejected(self) -> dict[str, list[str]]:
@@ -180,7 +183,7 @@ class Releases:
                 sweeps=held.sweeps,
                 streamed_s=held.streamed_s,
             )
-            storage.put(self._trial, _json(asdict(begun)), mode=0o644)
+            storage.put(self._counts, _json(asdict(begun)), mode=0o644)
         return ""
 
     def _judged(self, trial: RootState, report: ReleaseReport, boot: str) -> Standing:
@@ -210,7 +213,8 @@ class Releases:
         return f"{trial.release} was sent back, and {trial.back} runs again: {text}"
 
     def _end_trial(self) -> None:
-        self._trial.unlink(missing_ok=True)
+        for path in (self._trial, *self.folder.glob(f"{NAME}.trial-*")):
+            path.unlink(missing_ok=True)
         storage.sync(self.folder)
 
 
@@ -218,7 +222,7 @@ def own(environ: Mapping[str, str] = os.environ) -> tuple[RootState, Path] | Non
     """The trial of the release that this program belongs to, and the folder for its report; None
     without a trial, and for a program that systemd has not started as the service."""
     release, report = Path(sys.prefix).resolve(), environ.get("STATE_DIRECTORY")
-    trial = Releases(release.parent).trial if report else None
+    trial = Releases(release.parent, Path(report)).trial if report else None
     return (trial, Path(report)) if report and trial and trial.release == release.name else None
 
 
@@ -261,6 +265,14 @@ def main(argv: list[str] | None = None, environ: Mapping[str, str] = os.environ)
         print(f"palpate: {e}", file=sys.stderr)
         return e.exit_code if isinstance(e, ApplianceError) else 1
     return 0
+
+
+def _state(path: Path) -> RootState | None:
+    try:
+        held: RootState = typed(RootState, json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError):
+        return None
+    return held
 
 
 def _target(link: Path) -> str:

@@ -7,8 +7,9 @@ sweeps of its object. So the verdict must equal the verdict in its sidecar, bit 
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.taxels import BrokenTaxels
+from palpate.bundle import bundle as bundle_files
 from palpate.bundle.bundle import GOLDEN_TOLERANCE, Bundle
+from palpate.core import config
 from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
+from palpate.deployment.release_trial import OTHERWISE
 from palpate.inference.classifier import RULE, Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort, result
@@ -246,6 +250,16 @@ def changed(folder: Path, settings: Config, bundle: Bundle) -> tuple[int, list[s
     return count, found
 
 
+def main(argv: Sequence[str]) -> int:
+    """`python -m palpate.runtime.replay FOLDER BUNDLE`: say how many of the kept sweeps in a folder
+    this program answers otherwise. The exit code is OTHERWISE if there are any."""
+    folder, of = map(Path, argv)
+    count, found = changed(folder, config.load(None), bundle_files.load(of))
+    if found:
+        print(f"{len(found)} of {count} sweeps are answered otherwise ({found[-1]})")
+    return OTHERWISE if found else 0
+
+
 def _beyond(was: dict[str, Any], now: Verdict | None) -> str:
     """The change of an answer if it is larger than the tolerance, else ""."""
     if now is None:
@@ -314,3 +328,7 @@ def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
         source="replay",
     )
     box.run(lambda: play.finished)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -275,6 +275,113 @@ def test_a_report_of_an_earlier_trial_counts_for_nothing(box: TrialBox):
         assert (box.runs, box.releases.trial is not None) == (NEW, True)
 
 
+def comparing(box: TrialBox, trial: ReleaseTrial, program: str) -> release_trial.Comparison:
+    """A comparison by a proven release that is this shell program."""
+    proven = box.opt / OLD / "bin" / "python"
+    proven.parent.mkdir(exist_ok=True)
+    proven.write_text(f"#!/bin/sh\n{program}\n")
+    proven.chmod(0o755)
+    return release_trial.comparison(trial, box.report, box.report)
+
+
+def answer(box: TrialBox, trial: ReleaseTrial, program: str, n: int) -> int:
+    """Answer n sweeps; the number after which the program ends."""
+    compared = comparing(box, trial, program)
+    for i in range(n):
+        compared.answered(verdict())
+        for t in (i, i + 0.5):
+            compared.turn(health(t))
+            if compared._process:
+                compared._process.wait(10)
+        if trial.over:
+            return i + 1
+    compared.stopping()
+    return 0
+
+
+def test_a_release_that_answers_otherwise_goes_back_within_fifty_sweeps(box: TrialBox):
+    """By the box alone, with the reason; nothing is compared after fifty sweeps."""
+    trial = box.start()
+    assert trial
+    calls = box.opt / "calls"
+    program = f'echo "$@" >> {calls}; [ $(wc -l < {calls}) -lt 4 ] || {{ echo 2 of 40; exit 3; }}'
+    assert 40 <= answer(box, trial, program, 60) <= 50
+    assert "palpate.runtime.replay" in calls.read_text()
+    trial.stopping()
+    assert box.start() is None
+    assert (box.runs, box.releases.rejected[NEW][0]) == (OLD, "2 of 40")
+
+
+@pytest.mark.parametrize("program", ["exit 0", "exit 1", "echo of an old release; exit 2"])
+def test_a_release_that_answers_alike_stays(box: TrialBox, program: str):
+    """Also if the proven release cannot compare; five comparisons, and no more."""
+    trial = box.start()
+    assert trial
+    calls = box.opt / "calls"
+    assert answer(box, trial, f"echo >> {calls}; {program}", 90) == 0
+    assert len(calls.read_text()) == 5
+    trial.stopping()
+    assert box.start() is not None
+    assert box.runs == NEW
+
+
+def test_a_comparison_that_hangs_is_ended(box: TrialBox):
+    """After a minute, or with the program; nothing waits for it."""
+    trial = box.start()
+    assert trial
+    compared = comparing(box, trial, "exec sleep 600")
+    for _ in range(30):
+        compared.answered(verdict())
+    compared.turn(health(0))
+    first = compared._process
+    assert first
+    compared.turn(health(59))
+    assert compared._process is first
+    compared.turn(health(61))
+    assert (first.returncode, compared._process) == (-9, None)
+    compared.turn(health(62))
+    second = compared._process
+    compared.stopping()
+    assert second
+    assert second.returncode == -9
+
+
+def test_a_sweep_that_fails_ends_the_program(box: TrialBox):
+    """So the release goes back now; where nothing is left to go back to, it goes on."""
+    for there in (True, False):
+        trial = box.start()
+        assert trial
+        comparing(box, trial, "exit 0")
+        if not there:
+            trial.proven = str(box.opt / "nothing")
+        trial.answered(verdict(Status.FAILED))
+        assert trial.over == there
+
+
+def test_each_finger_of_a_hand_counts_its_own_starts(box: TrialBox):
+    """Two units start in turn, many times in order; then one dies three times."""
+    reports = [box.report.parent / f"palpate-{name}" for name in ("left", "right")]
+
+    def started(report: Path) -> ReleaseTrial | None:
+        report.mkdir(exist_ok=True)
+        box.releases = Releases(box.opt, report, box.boot)
+        box.env = {"STATE_DIRECTORY": str(report)}
+        return box.start()
+
+    for _ in range(6):
+        both = [started(report) for report in reports]
+        assert box.runs == NEW
+        for trial in both:
+            assert trial
+            trial.turn(health(1))
+            trial.stopping()
+    for _ in range(4):
+        started(reports[0])
+    assert (box.runs, list(box.releases.rejected)) == (OLD, [NEW])
+    assert started(reports[1]) is None
+    assert not list(box.opt.glob("*.trial*"))
+
+
 def test_a_program_that_is_no_service_observes_no_trial(box: TrialBox):
     """Nor does one of another release."""
     assert box.start() is not None

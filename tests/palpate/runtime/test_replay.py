@@ -15,15 +15,16 @@ import pytest
 
 from palpate.answer.early import Early
 from palpate.answer.taxels import Bridging, BrokenTaxels
-from palpate.bundle.bundle import Bundle
+from palpate.bundle.bundle import DEFAULT, Bundle
 from palpate.core import config
 from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.errors import FormatError
 from palpate.core.sweep_file import save, sidecar
 from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.deployment import release_trial
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.runtime.replay import changed, replay
+from palpate.runtime.replay import changed, main, replay
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
@@ -247,8 +248,11 @@ def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
     def worse(self: Classifier, taxels: np.ndarray, *names: str) -> Any:
         return outputs(self, np.clip(taxels * 1.1, 0, 255).astype(taxels.dtype), *names)
 
+    asked = [str(folder), str(DEFAULT)]
+    assert main(asked) == 0
     monkeypatch.setattr(Classifier, "outputs", worse)
     assert changed(folder, OTHERWISE, default_bundle)[1]
+    assert main(asked) == release_trial.OTHERWISE
 
 
 def test_a_changed_byte_is_told(in_service, default_bundle):

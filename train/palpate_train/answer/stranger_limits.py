@@ -36,10 +36,10 @@ LEAST_KEPT = {"strict": 0.5, "balanced": 0.5, "loose": 0.9}
 MOST_KEPT = 0.995
 """Least share of known sweeps within each limit, and the largest, at any cost. A box that refuses
 more is of no use; a wider limit only lets strangers in."""
-FEW_SWEEPS, LEAST_OF_FEW = 50, 0.9
-"""Up to this number of sweeps of a material, the balanced limit keeps such a share. Few sweeps say
-too little of strangers to give up known sweeps for them, and their cross-fits are farther away than
-new sweeps of the finished model."""
+FEW_SWEEPS, LEAST_OF_FEW, LEAST_BY_JUNK = 50, 0.9, 0.85
+"""Up to this number of sweeps of a material, the balanced limit keeps such a share, less with junk
+that shows where other things lie. Few sweeps say too little of strangers to give up known sweeps
+for them, and their cross-fits are farther away than new sweeps of the finished model."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""
@@ -159,7 +159,7 @@ def limits(
     made = [_log(distances) for distances in junk.values()]
     wrong, least_kept = named + _share_below(grid, made), dict(LEAST_KEPT)
     if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
-        least_kept["balanced"] = LEAST_OF_FEW
+        least_kept["balanced"] = LEAST_BY_JUNK if junk else LEAST_OF_FEW
     most, chosen = int(np.argmax(kept >= MOST_KEPT)), {}
     for name, cost in COSTS.items():
         cheapest = _cheapest(kept, wrong, stranger_cost * cost)
