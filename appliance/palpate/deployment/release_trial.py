@@ -1,7 +1,7 @@
 """Observes the trial of a release, as that of a bundle, in the service; root's part is in
 `releases`.
 
-In the trial the proven release answers the latest sweeps, too (Comparison). A sweep on which the
+In the trial the proven release answers the latest sweeps, too (ReleaseComparison). A sweep on which the
 new release fails, or which it answers otherwise with the same bundle, ends the program between two
 sweeps, and root sends the release back before the next start.
 """
@@ -91,7 +91,7 @@ class ReleaseTrial(Trial):
             self.goes_back(f"sweep {verdict.sweep} was not answered: {verdict.detail}")
 
 
-class Comparison(Observer):
+class ReleaseComparison(Observer):
     """The proven release answers the sweeps in a folder again. command: does that, and says what
     differs. differs: is told it."""
 
@@ -143,10 +143,10 @@ class Comparison(Observer):
             self._ended(self._process)
 
 
-def comparison(trial: ReleaseTrial, kept: Path, bundle: Path) -> Comparison:
+def comparison(trial: ReleaseTrial, kept: Path, bundle: Path) -> ReleaseComparison:
     """Compares the sweeps in the folder `kept`, which were answered by the bundle in a folder."""
     words = [trial.proven, "-I", "-m", "palpate.runtime.replay", str(kept), str(bundle)]
-    return Comparison(words, trial.goes_back)
+    return ReleaseComparison(words, trial.goes_back)
 
 
 def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:

@@ -275,7 +275,7 @@ def test_a_report_of_an_earlier_trial_counts_for_nothing(box: TrialBox):
         assert (box.runs, box.releases.trial is not None) == (NEW, True)
 
 
-def comparing(box: TrialBox, trial: ReleaseTrial, program: str) -> release_trial.Comparison:
+def comparing(box: TrialBox, trial: ReleaseTrial, program: str) -> release_trial.ReleaseComparison:
     """A comparison by a proven release that is this shell program."""
     proven = box.opt / OLD / "bin" / "python"
     proven.parent.mkdir(exist_ok=True)
