@@ -1,9 +1,9 @@
 """Observes the trial of a release, as that of a bundle, in the service; root's part is in
 `releases`.
 
-In the trial the proven release answers the latest sweeps, too (ReleaseComparison). A sweep on which the
-new release fails, or which it answers otherwise with the same bundle, ends the program between two
-sweeps, and root sends the release back before the next start.
+In the trial the proven release answers the latest sweeps, too (ReleaseComparison). A sweep on which
+the new release fails, or which it answers otherwise with the same bundle, ends the program between
+two sweeps, and root sends the release back before the next start.
 """
 
 from __future__ import annotations
