@@ -25,6 +25,8 @@ RIGHT = 0.6
 """Least share of the other sweeps of its material that are classified correctly then, and of the
 sweeps of the other material. If materials are often confused, a single sweep says nothing about its
 label."""
+CURVE = 4
+"""Number of further sweeps whose effect is estimated."""
 MORE = 3
 """Number of further sweeps that an advice names."""
 
@@ -43,6 +45,33 @@ class Suspect:
         return f"sweep {self.number} of {self.material} looks like {self.looks_like}"
 
 
+@dataclass(frozen=True, slots=True)
+class LearningCurve:
+    """The effect of sweeps on the material with most errors. sweeps: of the material. fewer: by how
+    many less a model was fitted. before, now: its share of sweeps that are classified correctly,
+    with fewer sweeps and with all."""
+
+    material: str
+    sweeps: int
+    fewer: int
+    before: float
+    now: float
+
+    @property
+    def text(self) -> str:
+        """The share to expect, if errors fall on as a power of the number of sweeps."""
+        n, less = self.sweeps, self.sweeps - self.fewer
+        told = f"with {less} instead of {n} sweeps of {self.material}"
+        if self.now <= self.before:
+            return f"{told} it would be no worse, so more of them may not help"
+        power = np.log((n + CURVE) / n) / np.log(n / less)
+        then = 1 - (1 - self.now) * ((1 - self.now) / (1 - self.before)) ** power
+        return (
+            f"{told} {100 * self.before:.0f} instead of {100 * self.now:.0f} % of them would be "
+            f"correct; {CURVE} more would bring this to about {100 * then:.0f} %"
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
     """Answers to left-out sweeps.
@@ -53,7 +82,7 @@ class Assessment:
     [N, K], mean probabilities. left_out: the groups that were left out. clusters: int [N], sweeps
     that succeed or fail together; None if each is on its own. others: for things that were not
     taught, in words, the share that would get a label and their number; empty if not measured.
-    unchecked: what nothing could check, in words.
+    unchecked: what nothing could check, in words. curve: None without errors or with few sweeps.
     """
 
     materials: tuple[str, ...]
@@ -66,6 +95,7 @@ class Assessment:
     no_slides: tuple[NoSlide, ...] = ()
     others: Mapping[str, tuple[float, int]] = field(default_factory=dict)
     unchecked: str = ""
+    curve: LearningCurve | None = None
 
     @property
     def right(self) -> Array:
@@ -127,14 +157,19 @@ class Assessment:
         if low >= ENOUGH:
             least = f"at least {100 * low:.0f} % of such sweeps are classified correctly"
             return f"enough: {least} (with 97.5 % certainty)"
-        wrong, held = self._counts(), self._sweeps()
-        np.fill_diagonal(wrong, 0)
-        errors = np.where(held > 0, wrong.sum(axis=0) + wrong.sum(axis=1), 0)
-        if errors.any():
-            return f"{MORE} more of {self.materials[int(errors.argmax())]}, from another place"
+        held = self._sweeps()
+        if (worst := self.worst()) is not None:
+            return f"{MORE} more of {self.materials[worst]}, from another place"
         fewest = self.materials[int(np.where(held > 0, held, np.inf).argmin())]
         few = f"nothing was confused, but {len(self.named)} sweeps are few"
         return f"{few}: {MORE} more of each, of {fewest} first"
+
+    def worst(self) -> int | None:
+        """The material with most errors among those that have sweeps, None without an error."""
+        wrong = self._counts()
+        np.fill_diagonal(wrong, 0)
+        errors = np.where(self._sweeps() > 0, wrong.sum(axis=0) + wrong.sum(axis=1), 0)
+        return int(errors.argmax()) if errors.any() else None
 
     def json(self) -> dict[str, Any]:
         pair, counts, (low, high) = self.confused(), self._counts(), self.interval
@@ -168,7 +203,8 @@ class Assessment:
             said += f"; most often confused: {one} and {other}"
         for what, (share, n) in self.others.items():
             said += f"; of {n} {what} {100 * share:.0f} % would get a label"
-        return f"{said}; {self.unchecked}" if self.unchecked else said
+        more = self.curve.text if self.curve else ""
+        return "; ".join(part for part in (said, more, self.unchecked) if part)
 
     def _counts(self) -> Array:
         """float [K, K], rows by the material of the sweeps, columns by the answers."""

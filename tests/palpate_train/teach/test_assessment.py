@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.learn.assessment import Assessment
+from palpate.learn.assessment import Assessment, LearningCurve
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import InnerPart
 from palpate_train.teach.assessment import assess, judged
@@ -54,6 +54,33 @@ def test_the_assessment_says_what_else_would_get_a_label():
         assert n >= 24
         assert f"of {n} " in found.text()
     assert [*found.json()["others"].values()] == [[*of] for of in found.others.values()]
+
+
+@pytest.mark.parametrize(
+    ("n", "before", "now", "least", "most"),
+    [(8, 0.5, 0.75, 0.8, 0.85), (8, 0.5, 1.0, 1.0, 1.0), (20, 0.8, 0.85, 0.87, 0.89)],
+)
+def test_further_sweeps_are_estimated_from_what_the_last_have_brought(n, before, now, least, most):
+    """Errors fall on as a power of the number of sweeps."""
+    said = LearningCurve("cork", n, 4, before, now).text
+    share = float(said.rsplit("about ")[1].split()[0]) / 100
+    assert least <= share <= most
+    assert f"{n} sweeps of cork" in said
+    assert "%" not in LearningCurve("cork", n, 4, now, now).text
+
+
+@pytest.mark.slow
+def test_the_assessment_estimates_what_more_sweeps_bring():
+    """For the material with most errors; nothing is said without an error or with three sweeps."""
+    rng, sweeps = np.random.default_rng(5), easy(8)
+    noise = 4 * rng.standard_normal(sweeps.samples.shape) * sweeps.samples.std()
+    noisy = np.clip(sweeps.samples + noise, 0, 255).astype(sweeps.samples.dtype)
+    found = assess(lesson(replace(sweeps, samples=noisy)))
+    assert found.curve
+    assert found.curve.material == found.materials[found.worst()]
+    assert (found.curve.sweeps, found.curve.fewer) == (8, 4)
+    assert found.curve.text in found.json()["text"]
+    assert assess(lesson(easy(8))).curve is None
 
 
 def test_few_or_wrong_sweeps_ask_for_more():

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.core.errors import ApplianceError
-from palpate.learn.assessment import Assessment
+from palpate.learn.assessment import CURVE, Assessment, LearningCurve
 from palpate_train.answer import stranger_limits
+from palpate_train.answer.heads import HeadData, HeadPart
 from palpate_train.data.run import Run
 from palpate_train.data.splitters import InnerPart, recording_parts
 from palpate_train.export import quantized_bundle, trial
@@ -31,6 +32,9 @@ from palpate_train.teach.lesson import Lesson
 from palpate_train.teach.taught import NAME
 
 Array = NDArray[Any]
+DRAWS, LEAST = 3, 2
+"""Draws of sweeps that are left out to see what they have brought, and the fewest sweeps of a
+material that remain."""
 
 
 def assess(lesson: Lesson) -> Assessment:
@@ -48,9 +52,37 @@ def assess(lesson: Lesson) -> Assessment:
         scores = setup.scores(fixed.data, parts)
         chosen = scores.score(chosen.plan.parts)
     found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
+    found = replace(found, curve=curve(found, setup, fixed.data, parts, chosen.plan.parts))
     with suppress(ApplianceError):  # too few sweeps for a bundle
         found = replace(found, others=others(recipe.finish(None, choice, setup)))
     return found
+
+
+def curve(
+    found: Assessment,
+    setup: recipe.Setup,
+    data: HeadData,
+    parts: Sequence[InnerPart],
+    heads: Sequence[HeadPart],
+) -> LearningCurve | None:
+    """What the last sweeps of the worst material have brought: some are left out, DRAWS times, and
+    the material's other sweeps judge."""
+    if (worst := found.worst()) is None:
+        return None
+    own = np.flatnonzero(found.labels == worst)
+    if len(own) < 2 * LEAST:
+        return None
+    fewer, rng = min(CURVE, len(own) // 2), np.random.default_rng(0)
+    before, now = [], []
+    for _ in range(DRAWS):
+        kept = ~np.isin(np.arange(len(data.labels)), rng.choice(own, fewer, replace=False))
+        left = [InnerPart(one.group, one.out[kept]) for one in parts if one.out[kept].any()]
+        scores = setup.scores(data.take(kept), left)
+        right = scores.right(scores.score(heads))[scores.own & (scores.labels == worst)]
+        before.append(float(right.mean()))
+        now.append(float(found.right[kept & (found.labels == worst)].mean()))
+    name = found.materials[worst]
+    return LearningCurve(name, len(own), fewer, float(np.mean(before)), float(np.mean(now)))
 
 
 def others(fit: Fit) -> dict[str, tuple[float, int]]:
