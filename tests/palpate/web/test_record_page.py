@@ -481,9 +481,9 @@ def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
 
 
 def test_a_material_may_be_called_as_things_of_script(browser, recorded):
-    """`constructor` and `valueOf` are names like others."""
+    """`constructor` and `toString` are names like others."""
     seen = opened(browser, recorded)
-    for name in ("constructor", "valueOf"):
+    for name in ("constructor", "valueOf", "toString"):
         seen.page.fill("#material", name)
         seen.page.press("#material", "Enter")
         until(lambda name=name: seen.text("#now") == f"{name} at 1")
