@@ -92,8 +92,8 @@ class ReleaseTrial(Trial):
 
 
 class ReleaseComparison(Observer):
-    """The proven release answers the sweeps in a folder again. command: does that, and says what
-    differs. differs: is told it."""
+    """The proven release answers the sweeps in a folder again. command: the program that does it.
+    differs: gets the text of this program if answers differ."""
 
     def __init__(self, command: Sequence[str], differs: Callable[[str], object]) -> None:
         self._command, self._differs = command, differs
@@ -129,7 +129,7 @@ class ReleaseComparison(Observer):
             self._differs(said)
 
     def _ended(self, process: subprocess.Popen[bytes]) -> str:
-        """What it said, at most a pipe's content."""
+        """Its text."""
         process.kill()
         process.wait()
         self._process = None

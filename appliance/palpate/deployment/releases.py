@@ -1,4 +1,4 @@
-"""Two releases on the box, and the trial of the new one. The box ends this trial by itself.
+"""Two releases on the box, and the trial of the new release. The box ends this trial by itself.
 
 A release is a folder, /opt/palpate-VERSION; /opt/palpate leads to the present release, and
 /opt/palpate.previous to the proven one. While a release is on trial, /opt/palpate.trial holds the
