@@ -42,6 +42,8 @@ SCALES: Mapping[str, Scale] = {
     "papillarray": Scale(gain=0.02, noise=0.01, least=-100, most=100),  # N
     "anyskin": Scale(rest=-120, gain=6, noise=2, least=-5000, most=5000),  # uT
     "reskin": Scale(rest=-120, gain=6, noise=2, least=-5000, most=5000),
+    "paxini": Scale(gain=0.5, least=-128, most=127),  # 0.1 N
+    "bota-serial": Scale(gain=0.2, noise=0.05, least=-500, most=500),  # N
     "xela-can": Scale(rest=20_000, gain=80, noise=30, most=0xF9FF),
     "robotiq-tsf": Scale(rest=12_000, gain=60, noise=20, most=0xFFFF),
 }
