@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.io.skin_codecs.text import as_float, closes, split
+from palpate.io.skin_codecs.text import COLOUR, as_float, closes, split
 
 LEAST_LINES = 8
 LEAST_SHARE = 0.8
@@ -30,9 +30,6 @@ LEAST_CYCLES = 3
 _FIRST = re.compile(rb"[^-+.0-9]*([0-9]{1,6})(?=[^0-9.])")
 """The first whole number of a line, which may be its own."""
 _CONTROL = re.compile(rb"[^\t\n\r\x1b\x20-\x7e\x80-\xff]")
-_COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
-"""What log lines begin and end with on a terminal."""
-
 Line = tuple[list[bytes], str]
 """Numbers of a line, and the text around them."""
 
@@ -43,6 +40,7 @@ def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -
     frame shows in the lines, the grid does not: without one, it is the squarest."""
     if not is_text(data):
         return ""
+    data = COLOUR.sub(b"", data)
     lines, decimal, end = _divided(data)
     forms = Counter((len(words), around) for words, around in lines if words)
     if forms.total() < LEAST_LINES:
@@ -56,6 +54,8 @@ def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -
     if height > 1 and often / height / seconds >= LEAST_HZ:
         return ""
     skipped = _rising(np.array([[as_float(word) for word in words] for words in alike if words]))
+    if width == len(skipped):
+        return ""  # a count alone
     rows, cols = grid or _grid(width - len(skipped))
     if rows * cols != width - len(skipped):
         return ""
@@ -97,7 +97,8 @@ def _divided(data: bytes) -> tuple[list[Line], str, str]:
     words comes after each list of lists."""
     end = "\n" if b"\n" in data else "\r"
     sent = data.split(end.encode())[1:-1]
-    parted = sum(b"," in line and (b";" in line or b"\t" in line) for line in sent)
+    inner = [line.strip(b"; \t\r") for line in sent]
+    parted = sum(b"," in line and (b";" in line or b"\t" in line) for line in inner)
     decimal = "," if 2 * parted > len(sent) else "."
     lines: list[Line] = []
     for line in sent:
@@ -109,7 +110,7 @@ def _divided(data: bytes) -> tuple[list[Line], str, str]:
 
 def odd_line(data: bytes) -> str:
     """A line of a text that is not of the commonest form; empty for other bytes."""
-    lines = [_COLOUR.sub(b"", line).strip() for line in data.splitlines() if line.strip()]
+    lines = [COLOUR.sub(b"", line).strip() for line in data.splitlines() if line.strip()]
     lines = lines[1:-1] or lines
     if not is_text(data) or not lines:
         return ""

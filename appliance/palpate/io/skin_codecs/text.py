@@ -43,6 +43,8 @@ equals sign, label one."""
 _SUM = re.compile(rb"\$([^*]*)\*([0-9A-Fa-f]{2})\s*")
 """A sentence with the exclusive or of its characters, as in NMEA 0183."""
 
+COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
+"""What log lines begin and end with on a terminal."""
 _DIGITS = re.compile(rb"[0-9]+")
 _MOST_FLOAT = float(np.finfo(np.float32).max)
 _SHOWN = 40
@@ -129,7 +131,7 @@ def split(line: bytes, decimal: str = ".") -> tuple[list[bytes], str]:
     words = line.translate(_BETWEEN[decimal]).split()
     if all(map(_DECIMAL.fullmatch, words)):
         return words, ""
-    text = _STAMP.sub(b" ", line)
+    text = _STAMP.sub(b" ", COLOUR.sub(b"", line))
     if summed := _SUM.fullmatch(text):
         if reduce(xor, summed[1], 0) != int(summed[2], 16):
             return [], "another sum"
