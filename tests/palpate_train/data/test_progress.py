@@ -2,7 +2,7 @@
 
 import pytest
 
-from palpate_train.data.progress import Progress, ProgressLine, spoken
+from palpate_train.data.progress import Progress, ProgressLine, StepTimes, spoken
 
 
 class SteppedClock:
@@ -34,6 +34,17 @@ def test_progress_shows_how_much_is_left():
     clock.now += 120
     progress.begin("b")
     assert lines == ["0/3 done (a)", "1/3 done, 4 min left (b)"]
+
+
+def test_steps_of_unequal_length_tell_the_time_left():
+    """By their shares, of the steps that there are."""
+    told: list[tuple[str, float, float | None]] = []
+    clock = SteppedClock()
+    steps = StepTimes({"a": 0.1, "b": 0.3}, lambda *one: told.append(one), clock)
+    steps.begin("a")
+    clock.now += 10
+    steps.begin("b")
+    assert told == [("a", 0, None), ("b", pytest.approx(0.25), pytest.approx(30))]
 
 
 @pytest.mark.parametrize(

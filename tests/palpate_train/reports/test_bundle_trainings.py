@@ -119,6 +119,8 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     assert "mine 1: " in text
     assert "training on 2, 4, 8" in text
     assert "gets a known label" in text
+    said = capsys.readouterr().err
+    assert all(step in said for step in ("export", "answers", "trainings", "pictures"))
     assert isinstance(Fit.load(fit), Fit)
     assert main(["report", str(tmp_path / "t.npz"), *named[2:]]) == FormatError.exit_code
     assert "t.npz: not a fit" in capsys.readouterr().err

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 Clock = Callable[[], float]
+Tell = Callable[[str, float, float | None], None]
+"""Takes the name of the step that begins, the share that is done, and the seconds that are left,
+None if they are unknown."""
 
 
 class ProgressLine(str):
@@ -71,6 +74,23 @@ class Progress:
         took = self._clock() - self._start
         left_s = took / self.done * (self._total - self.done) if self.done else None
         self._log(ProgressLine.of(self.done, self._total, left_s, what))
+
+
+class StepTimes:
+    """Tells the steps of some work with the time left, by the time that the steps before took.
+    shares: of the time that each step takes, in their order."""
+
+    def __init__(
+        self, shares: Mapping[str, float], tell: Tell, clock: Clock = time.monotonic
+    ) -> None:
+        self._shares, self._tell, self._clock = shares, tell, clock
+        self._start, self._done = clock(), 0.0
+
+    def begin(self, step: str) -> None:
+        """The step begins, and the one before is done."""
+        took, done = self._clock() - self._start, self._done / sum(self._shares.values())
+        self._tell(step, done, took * (1 - done) / done if done else None)
+        self._done += self._shares[step]
 
 
 def spoken(seconds: float) -> str:

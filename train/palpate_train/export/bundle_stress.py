@@ -33,9 +33,10 @@ def under_corruptions(
     seeds: Sequence[int],
     log: Callable[[str], None] = lambda line: None,
     corruptions: Sequence[Corruption] | None = None,
+    wanted: Sequence[str] = ANSWERS,
 ) -> Json:
-    """Curves by answer (ANSWERS) and corruption, see robustness.merge; `falls` is of correctly
-    classified sweeps.
+    """Curves by answer (wanted, of ANSWERS) and corruption, see robustness.merge; `falls` is of
+    correctly classified sweeps.
 
     seeds: of the corruptions. corruptions: None for all that apply. Raises FormatError if the
     sweeps are not of the bundle's format, or have a material that it lacks.
@@ -48,27 +49,32 @@ def under_corruptions(
             f"({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
             f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
         )
-    clean, tasks = answers(box, sweeps), []
+    alone = "network" in wanted
+    clean, tasks = answers(box, sweeps, alone=alone), []
     corruptions = applicable(test) if corruptions is None else corruptions
     progress = Progress(len(seeds) * len(corruptions), log)
     for seed in seeds:
-        trials = {answer: robustness.CorruptionCounts(test) for answer in ANSWERS}
+        trials = {answer: robustness.CorruptionCounts(test) for answer in wanted}
         for corruption in corruptions:
             progress.begin(f"{corruption.name} as the box answers, seed {seed}")
             found = [clean]
             for severity in corruption.severities[1:]:
                 samples = corruption.apply(test, severity, seed)
                 lost = round(severity * sweeps.format.window) * (corruption.name == "lost")
-                found.append(answers(box, replace(sweeps, samples=samples), lost))
+                altered = replace(sweeps, samples=samples)
+                found.append(answers(box, altered, lost, alone=alone))
             for answer, counted in trials.items():
                 counted.add(corruption, [given[answer] for given in found])
         tasks += [counted.task(answer, seed) for answer, counted in trials.items()]
     return {name: entry["curves"] for name, entry in robustness.merge(tasks)["methods"].items()}
 
 
-def answers(box: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
+def answers(
+    box: Classifier, sweeps: Dataset, lost: int = 0, *, alone: bool = True
+) -> dict[str, Array]:
     """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
-    five. lost: frames of each sweep that never arrived."""
+    five. lost: frames of each sweep that never arrived. alone: whether to ask the network alone,
+    too."""
     given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
     labels = box.bundle.manifest.labels
     for i, verdict in bundle_score.verdicts(box, sweeps, lost=lost):
@@ -82,5 +88,6 @@ def answers(box: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]
                 else "refused"
             )
         given[answer][i] = True
-        given["network"][i] = labels[int(box.logits(sweeps.samples[i]).argmax())] == truth
+        if alone:
+            given["network"][i] = labels[int(box.logits(sweeps.samples[i]).argmax())] == truth
     return given

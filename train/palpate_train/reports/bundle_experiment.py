@@ -147,7 +147,9 @@ def corruptions(classifier: Classifier, test: EvaluationSweeps, log: Log, seed: 
 
     falls: the severity at which five points are lost; None if they never are.
     """
-    given = bundle_stress.under_corruptions(classifier, test, (seed,), log)
+    given = bundle_stress.under_corruptions(
+        classifier, test, (seed,), log, wanted=("correct", "wrong")
+    )
     right, wrong = given["correct"], given["wrong"]
     first = breaks_first(right)
     others = sorted(right.keys() - set(first), key=lambda name: (right[name]["right"][-1], name))

@@ -3,9 +3,8 @@ checks."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from palpate.bundle.bundle import Manifest
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
+from palpate_train.data.progress import StepTimes, Tell
 from palpate_train.data.run import Run
 from palpate_train.export import quantized_bundle
 from palpate_train.models.recipe import recipe
@@ -27,27 +27,6 @@ LEAST = 3
 SHARES = {"features": 0.06, "heads": 0.14, "bundle": 0.8}
 """Share of the time that each step takes, measured with 216 sweeps."""
 
-Tell = Callable[[str, float, float | None], None]
-"""Takes the name of the step that begins, the share that is done, and the seconds that are left,
-None if they are unknown."""
-
-
-@dataclass
-class StepTimes:
-    """Tells the steps of a fit with the time left, by the time that the steps before took."""
-
-    tell: Tell
-    clock: Callable[[], float] = time.monotonic
-
-    def __post_init__(self) -> None:
-        self._start, self._done = self.clock(), 0.0
-
-    def begin(self, step: str) -> None:
-        took = self.clock() - self._start
-        left = took * (1 - self._done) / self._done if self._done else None
-        self.tell(step, self._done, left)
-        self._done += SHARES[step]
-
 
 def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: Tell) -> Manifest:
     """Fit a model to the lesson and write its bundle to `out`, whole or not at all. about: who
@@ -56,7 +35,7 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
     Raises FormatError if there are too few sweeps or materials, or if chance would name them as
     well, and ExportRefused if a check of the bundle fails.
     """
-    sweeps, times = lesson.sweeps, StepTimes(tell)
+    sweeps, times = lesson.sweeps, StepTimes(SHARES, tell)
     counts = np.bincount(sweeps.labels)
     if few := [name for name, n in zip(sweeps.materials, counts, strict=True) if n < LEAST]:
         raise FormatError(
