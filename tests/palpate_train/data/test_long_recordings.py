@@ -10,7 +10,9 @@ from palpate.answer import time_series
 from palpate.answer.unloaded import UnloadedSkin
 from palpate.answer.vibration import vibration
 from palpate.answer.window import Window
+from palpate.core.clock import SystemClock
 from palpate.core.types import SweepFormat
+from palpate.sweeps.sweep_check import SweepCheck
 from palpate_train.data.augment import texture_scale
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.junk import Slides
@@ -18,7 +20,8 @@ from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import log_powers
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred, run
 
-FRAMES = 200_000
+FRAMES = 1_350_000
+"""Half an hour at 750 Hz."""
 COUNTS = (50_000 + np.random.default_rng(0).normal(size=(FRAMES, 2, 2))).astype(np.float32)
 EXACT = COUNTS.astype(np.float64)
 WINDOW = 8_800
@@ -35,9 +38,20 @@ def graph_means() -> np.ndarray:
     return run(model, SWEEPS.samples).mean(axis=2, dtype=np.float64)
 
 
+def tared() -> SweepCheck:
+    """A recording that takes a tare."""
+    return SweepCheck(SweepFormat(2, 2, 750.0, WINDOW, "float32"), SystemClock())
+
+
 CASES: dict[str, tuple[Callable[[], Any], Any, float]] = {
     "unloaded level": (lambda: UnloadedSkin.measured(COUNTS).level, EXACT.mean(axis=0), 1e-6),
     "unloaded noise": (lambda: UnloadedSkin.measured(COUNTS).noise, EXACT.std(axis=0), 1e-6),
+    "tare": (lambda: float(tared().set_tare(COUNTS).split()[1]), EXACT.mean(axis=0).max(), 0.06),
+    "tare, 16 bits": (
+        lambda: float(tared().set_tare(np.rint(COUNTS).astype(np.uint16)).split()[1]),
+        EXACT.mean(axis=0).max(),
+        0.06,
+    ),
     "window": (lambda: Window(COUNTS[:WINDOW]).mean, EXACT[:WINDOW].mean(axis=0).ravel(), 1e-3),
     "features": (lambda: time_series.means(time_series.of(COUNTS)), EXACT.mean(0).ravel(), 1e-6),
     "vibration": (
