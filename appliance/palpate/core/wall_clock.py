@@ -38,7 +38,7 @@ def of(at_s: float, to: str = "seconds") -> str:
 def last_s(times: str, days: int = 0) -> float:
     """When the last of these times of day was, such as "06:00 14:00", in this computer's zone, less
     a number of days; in seconds since 1970. Raises ValueError for other texts."""
-    now = datetime.now().astimezone()
+    now = datetime.now()  # without a zone: another day can have another offset from UTC
     begins = [now.replace(hour=0, minute=0, second=0, microsecond=0)]
     if times.split():
         found = [time.fromisoformat(one) for one in times.split()]

@@ -390,7 +390,8 @@ class RecordingSession(Observer):
         numbers = [n for n, labels in self._counted.items() if labels.material == old]
         if not old or (not numbers and self._labels[-1][1].material != old):
             raise ApplianceError(f"no sweep is of {old!r}; name a material that was recorded")
-        moved = _Moved(f"{old} to {new}", dict.fromkeys(numbers, old), (new, old))
+        ahead = self._labels[-1][1].material != new
+        moved = _Moved(f"{old} to {new}", dict.fromkeys(numbers, old), (new, old), ahead)
 
         def done() -> list[object]:
             self._undo.append(moved)
@@ -412,7 +413,8 @@ class RecordingSession(Observer):
 
         back = {n: label for n, label in last.before.items() if n in self._counted}
         reply = self._relabel(back, done)
-        self._call(*last.names)
+        if last.ahead:
+            self._call(*last.names)
         return reply
 
     def _relabel(self, materials: Mapping[int, str], done: Callable[[], list[object]]) -> Reply:
@@ -444,11 +446,12 @@ class RecordingSession(Observer):
 @dataclass(frozen=True, slots=True)
 class _Moved:
     """What UNDO undoes: in words, the materials of the sweeps before, and the name of a renamed
-    material with its former name."""
+    material with its former name. ahead: also for sweeps to come, which had another name before."""
 
     what: str
     before: Mapping[int, str]
     names: tuple[str, str] = ("", "")
+    ahead: bool = True
 
 
 def _material(label: str) -> str:

@@ -368,6 +368,20 @@ def test_a_sweep_is_moved_a_material_renamed_and_that_undone(tmp_path):
     assert found() == [("wood", None)] * 2
 
 
+@pytest.mark.parametrize(("current", "to_come"), [("wood", "wood"), ("oak", "oak"), ("elm", "elm")])
+def test_two_materials_become_one_and_that_undone(tmp_path, current, to_come):
+    """Each sweep has its own again, and sweeps to come have what they had before."""
+    desk = Desk(tmp_path)
+    desk.sweep(1)
+    desk.do("MATERIAL", "oak")
+    desk.sweep(2)
+    desk.do("MATERIAL", current)
+    assert desk.do("RENAME", "wood,oak") == ["oak", 2]
+    desk.do("UNDO")
+    assert desk.recording.materials() == {"wood": 1, "oak": 1}
+    assert desk.sweep(3)[3] == to_come
+
+
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_what_became_of_the_last_sweep_is_kept(tmp_path, earlier):
     """As in REC, for displays; an earlier run does not count."""
