@@ -1,5 +1,5 @@
 """The box as a ROS 2 node with a lifecycle, over its serial line or its feed. Publishes verdicts,
-state, frames and diagnostics in standard messages, and offers
+state, frames and diagnostics in standard messages and in those of ros_optional.py, and offers
 services and the action of palpate_msgs (docs/robots/ros2.md)."""
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
+from palpate.bridges.ros_optional import OptionalTopics
 from palpate.bridges.source import BoxView, FeedSource, LineSource, Source
 from palpate.client.answers import Answer
 from palpate.client.box import BAUD, Heard
@@ -148,6 +149,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._shown: tuple[Any, ...] = ()
         self._made: list[tuple[Callable[[Any], object], Any]] = []
         self._sweeps = self._sweep_action()
+        self._optional = OptionalTopics(self)
+        for topic, why in self._optional.missing.items():
+            self.get_logger().info(f"~/{topic} is not published ({why})")
         if self.setting("autostart"):
             self.trigger_configure()
             self.trigger_activate()
@@ -179,6 +183,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._verdicts = self.create_lifecycle_publisher(DiagnosticArray, "~/verdict", RELIABLE)
         self._states = self.create_lifecycle_publisher(DiagnosticArray, "~/state", LATCHED)
         self._frames = self.create_lifecycle_publisher(Image, "~/frames", qos_profile_sensor_data)
+        self._optional.open({"tactile": qos_profile_sensor_data, "classification": RELIABLE})
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # a command may take seconds, and verdicts must not wait for it
         asking = MutuallyExclusiveCallbackGroup()
@@ -208,6 +213,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             destroy(thing)
         for publisher in (self._verdicts, self._states, self._frames) if self._made else ():
             self.destroy_lifecycle_publisher(publisher)
+        self._optional.close()
         self._made, self._shown = [], ()
         self._news.clear()
         return TransitionCallbackReturn.SUCCESS
@@ -258,7 +264,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             if isinstance(news, Answer):
                 code = self._source.view().code
                 each = (verdict_status(of, code(of.label)) for of in (news, *news.fingers))
-                self._verdicts.publish(self._array(*each))
+                array = self._array(*each)
+                self._verdicts.publish(array)
+                self._optional.answered(news, array.header)
             elif isinstance(news, Mapping):
                 self._publish_frame(news)
             else:
@@ -270,6 +278,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.setting("frame_id")
         self._frames.publish(message)
+        self._optional.frame(line["taxels"], message.header)
 
     def _show(self, view: BoxView) -> None:
         """Publish the state if it has changed."""
