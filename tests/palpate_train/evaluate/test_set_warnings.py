@@ -44,6 +44,20 @@ def test_what_no_fold_can_judge_is_counted():
     assert of_protocol(stated, "random:4") == []
 
 
+@pytest.mark.parametrize(("count", "told"), [(None, ""), (100, "stuck-taxel"), (255, "saturated")])
+def test_sweeps_that_the_box_would_refuse_are_counted(count: int | None, told: str):
+    """Before a fit: a loaded taxel that never changes, and counts at the end of the range."""
+    rng = np.random.default_rng(2)
+    samples = rng.integers(60, 140, (12, 64, 2, 2)).astype(np.uint8)
+    if count is not None:
+        samples[:3, :, 0, 0] = count
+    sweeps = Dataset(samples, np.arange(12) % 2, ("a", "b"), 100.0, {}, "skin")
+    lines = [line for line in set_warnings.of_set(sweeps) if "box would refuse" in line]
+    assert len(lines) == bool(told)
+    assert all("3 of 12 sweeps" in line and told in line for line in lines)
+    assert set_warnings.of_set(sweeps, learned=False) == []
+
+
 def test_baselines_find_what_they_look_at():
     """Means offsets, bands pitches; a better one is named, an equal one is not."""
     folds = Protocol("leave:session").folds(tones(), 1)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.window_check import WindowLimits, inspect
+from palpate.core.status import Status
+from palpate_train.answer.fit_contact import find_limit
 from palpate_train.data import repeats
+from palpate_train.data.readers import counted
 from palpate_train.data.sets import Dataset, shortened
 from palpate_train.data.splitters import OF_THE_SET
 from palpate_train.evaluate import level_check
@@ -18,11 +23,33 @@ Array = NDArray[Any]
 
 def of_set(sweeps: Dataset, learned: bool = True) -> list[str]:
     """The warnings about a set: sweeps that it holds twice; and if a model can learn from it,
-    materials that were recorded under one condition only, and the mean level."""
+    sweeps that the box would refuse, materials that were recorded under one condition only, and
+    the mean level."""
     twice = repeats.warnings_of(sweeps, repeats.pairs(sweeps))
     if not learned:
         return list(twice)
-    return [*twice, *_coinciding(sweeps), *level_check.warnings_of(sweeps)]
+    return [
+        *_refused(sweeps),
+        *twice,
+        *_coinciding(sweeps),
+        *level_check.warnings_of(sweeps),
+    ]
+
+
+def _refused(sweeps: Dataset) -> Iterator[str]:
+    """A warning about sweeps that the box would refuse by its check of a window, which no figure
+    of a fit contains. It bridges some broken taxels only where export proves that this pays."""
+    limit, kind = find_limit(sweeps), sweeps.samples.dtype
+    top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
+    limits = WindowLimits(limit.contact, float(top))
+    status = [inspect(window, limit.tare, limits).status for window in sweeps.samples]
+    refused = Counter(str(one) for one in status if one is not Status.OK)
+    if refused:
+        yield (
+            f"warning: the box would refuse {refused.total()} of {len(sweeps)} sweeps unless it "
+            f"may bridge their taxels: {counted(refused)}; drop them or mend the skin, for export "
+            "refuses a fit to many of them"
+        )
 
 
 def _coinciding(sweeps: Dataset) -> Iterator[str]:
