@@ -8,6 +8,7 @@ import argparse
 import json
 import os
 import platform
+import random
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -32,7 +33,7 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
     "teaching": lambda beside: teaching.TeachingShop.opened(beside).teaching(),
 }
 """Makes each scene; the argument is an empty folder for the files that it needs."""
-HOWS = ("kill", "power", "kill_then_power")
+HOWS = ("kill", "power", "kill_then_power", "timed")
 
 
 def main() -> int:
@@ -51,6 +52,12 @@ def main() -> int:
         action="store_true",
         help="also kill each command and start it again, and then cut the power (hours)",
     )
+    parser.add_argument(
+        "--times",
+        type=int,
+        metavar="N",
+        help="instead kill each command and its processes at N random instants",
+    )
     given = parser.parse_args()
     if wrong := set(given.scenes) - set(SCENES):
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
@@ -62,7 +69,9 @@ def main() -> int:
         print(json.dumps(_head()), file=out)
         for name in given.scenes or SCENES:
             with TemporaryDirectory(prefix="cuts-") as beside:
-                for point in cut(SCENES[name](Path(beside)), HOWS if given.twice else HOWS[:2]):
+                scene = SCENES[name](Path(beside))
+                hows = HOWS[:3] if given.twice else HOWS[:2]
+                for point in timed(scene, given.times) if given.times else cut(scene, hows):
                     points.append(point)
                     print(json.dumps(asdict(point)), file=out, flush=True)
                     print(".", end="", flush=True)
@@ -83,7 +92,17 @@ def _head() -> dict[str, str]:
     }
 
 
-def cut(scene: CutScene, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
+def timed(scene: CutScene, times: int) -> Iterator[CrashPoint]:
+    """Kill each command of a scene at random instants."""
+    rng = random.Random(scene.name)
+    with stage() as work:
+        play = ScenePlay(scene, Path(work))
+        for number in range(len(scene.steps)):
+            for _ in range(times):
+                yield play.timed(number, rng.random())
+
+
+def cut(scene: CutScene, hows: Sequence[str] = HOWS[:3]) -> Iterator[CrashPoint]:
     """Cut a scene in these ways at all its points."""
     with stage() as work:
         play = ScenePlay(scene, Path(work))

@@ -9,8 +9,12 @@ afterwards, and each moment becomes a point with its findings.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import signal
+import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,6 +36,8 @@ SPARE_CALLS = 300
 MAPPED = re.compile(r"-shm$")
 """SQLite's shared index, which it writes without calls and makes anew after a crash."""
 ENVIRONMENT = {"PYTHONPATH": SOURCES}
+LONGEST_S = 300.0
+"""Longest time of a command that nothing kills."""
 
 
 def stage() -> TemporaryDirectory[str]:
@@ -134,6 +140,7 @@ class ScenePlay:
     before: list[tree.Tree] = field(default_factory=list)
     runs: list[TracedRun] = field(default_factory=list)
     judged: dict[tuple[str, str, str], tuple[str, ...]] = field(default_factory=dict)
+    took_s: dict[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.work = self.work.resolve()
@@ -182,6 +189,41 @@ class ScenePlay:
         run = self._run(step.cut(moment.call, self.runs[moment.step]))
         output = "".join(BETWEEN + run.output for run in (*self.runs[: moment.step], run))
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
+
+    def timed(self, number: int, share: float) -> CrashPoint:
+        """A command and all its processes are killed after a share of the time that it takes."""
+        step = self.scene.steps[number]
+        took_s, _ = self._timed(number, 0.0)
+        _, heard = self._timed(number, share * took_s)
+        output = "".join(
+            BETWEEN + said for said in (*(r.output for r in self.runs[:number]), heard)
+        )
+        wrong = self._judged(tree.read(self.folder), step, output)
+        at = f"{1000 * share * took_s:.0f} of {1000 * took_s:.0f} ms"
+        return CrashPoint(self.scene.name, step.name, "timed", 0, at, 1, wrong)
+
+    def _timed(self, number: int, after_s: float) -> tuple[float, str]:
+        """Run a command, and kill its group after a time unless that is 0; the time that it takes
+        whole, and its output."""
+        if not after_s and number in self.took_s:
+            return self.took_s[number], ""
+        self._restore(self.before[number])
+        begin = time.monotonic()
+        with subprocess.Popen(
+            [str(word) for word in self.scene.steps[number].command(self.folder)],
+            env=os.environ | ENVIRONMENT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        ) as process:
+            try:
+                heard, _ = process.communicate(timeout=after_s or LONGEST_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                heard, _ = process.communicate()
+        return self.took_s.setdefault(number, time.monotonic() - begin), heard
 
     def kill_then_power(self, moment: Moment) -> CrashPoint:
         """Killed, started again, and without power at each moment. Raises NotFollowed."""
