@@ -23,6 +23,9 @@ RUN = 8
 LEAST_SHARED = 1 / 8
 """Least share of the window that two sweeps must have in common."""
 BATCH = 256
+"""Sweeps that are hashed at a time."""
+WORD = 4
+"""Bytes of a frame that are hashed together."""
 MOST_KEPT = 512
 """Largest number of digests of training sweeps that a bundle keeps: those with the lowest values,
 which are a random sample of all (a bottom-k sketch, Cohen and Kaplan 2007)."""
@@ -113,14 +116,16 @@ def _frame_hashes(samples: Array) -> Array:
     """A hash uint64 [N, T] of each frame."""
     n, frames = samples.shape[:2]
     rng = np.random.default_rng(0)
-    factors = rng.integers(1, 1 << 63, samples[0, 0].size, dtype=np.uint64) | np.uint64(1)
+    factors = rng.integers(
+        1, 1 << 63, samples[0, 0].nbytes // WORD + 1, dtype=np.uint64
+    ) | np.uint64(1)
     hashes = np.empty((n, frames), np.uint64)
-    whole = {"f": np.uint32}.get(samples.dtype.kind)
     for first in range(0, n, BATCH):
         part = np.ascontiguousarray(samples[first : first + BATCH])
-        part = part.view(whole) if whole else part
-        flat = part.reshape(len(part), frames, -1).astype(np.uint64)
-        hashes[first : first + BATCH] = (flat * factors).sum(axis=2, dtype=np.uint64)
+        own = part.reshape(len(part), frames, -1).view(np.uint8)
+        filled = np.pad(own, ((0, 0), (0, 0), (0, -own.shape[2] % WORD)))
+        words = filled.view(np.uint32).astype(np.uint64)  # the fewer numbers, the faster
+        hashes[first : first + BATCH] = words @ factors[: words.shape[2]]
     return hashes
 
 
