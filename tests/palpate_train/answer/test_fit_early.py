@@ -13,7 +13,7 @@ from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
 from palpate.inference import classifier
-from palpate_train.answer import calibrate, fit_early
+from palpate_train.answer import calibrate, embedding, fit_early
 from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.contents import means_file
 from palpate_train.onnx_tools.graph_builder import run
@@ -126,7 +126,8 @@ def test_each_step_has_its_own_temperature():
         calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool))),
         np.ones(len(y), bool),
     )
-    logits, numbers = fit_early.cross_fitted_logits(x, y, at, every)
+    judging = embedding.cross_fitted(x[:, -1], y, at, every)
+    logits, numbers = fit_early.cross_fitted_logits(x, y, judging)
     cooler = fit_early.fit_temperatures(logits, y[numbers], at[numbers])
     assert len(set(cooler)) > 2
     assert min(done.temperature, cooler[-1]) > 1

@@ -299,7 +299,7 @@ def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
     )
     labels = fitted.train.labels
     weight, bias = fitted.plan.fit(
-        HeadData(seen, labels, seen[:0], labels[:0], np.empty((len(labels), 0))), 3
+        HeadData(seen, labels, lambda: seen[:0], labels[:0], np.empty((len(labels), 0))), 3
     )
     temperature = platt_temperature(unseen @ weight.T + bias, fitted.held.labels)
     weight, bias = weight / temperature, bias / temperature

@@ -29,6 +29,7 @@ from palpate_train.answer import fit_displacement, fit_early
 from palpate_train.answer.embedding import (
     NOTHING,
     Embedding,
+    JudgingPart,
     cross_fitted,
     embed,
     in_two_views,
@@ -215,6 +216,18 @@ class CalibrationInputs:
         """int [N], the values of the hardest condition."""
         return next(iter(self.conditions.values()))
 
+    @cached_property
+    def _judges(self) -> dict[bytes, list[JudgingPart]]:
+        return {}
+
+    def cross_fitted(self, values: Array, judged: Array) -> list[JudgingPart]:
+        """See embedding.cross_fitted; computed once for the same values and sweeps."""
+        key = values.tobytes() + judged.tobytes()
+        if key not in self._judges:
+            given = self.whole, self.labels, values, judged, self.fixed, self.beyond
+            self._judges[key] = list(cross_fitted(*given))
+        return self._judges[key]
+
     @property
     def judged(self) -> Array:
         """bool [N], the sweeps that judge."""
@@ -239,7 +252,7 @@ class CalibrationInputs:
         copied = self.copied.take(~self.copied.held)
         values = condition_values(self.conditions, len(self.labels))
         return HeadData(
-            self.whole, self.labels, copied.features, copied.source, values, self.weights
+            self.whole, self.labels, lambda: copied.features, copied.source, values, self.weights
         )
 
     def naming_head(self, seen: Array) -> tuple[Array, Array]:
@@ -255,7 +268,8 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     """The calibration that is fitted to these features. Raises FormatError as `embed`, and if there
     is only one group or no sweep to judge by."""
     whole, labels = given.whole, given.labels
-    logits, numbers, class_mean_temperature = _prefix_logits(given)
+    named = {name: _named(given, values) for name, values in given.conditions.items()}
+    logits, numbers, class_mean_temperature = _prefix_logits(given, *next(iter(named.values())))
     groups = given.groups[numbers]
     temperatures = fit_early.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
@@ -265,10 +279,9 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     distances = left_out_in_turn(given, embedding)
     beyond = limits(distances, junk=junk_distances(given, embedding))
     held = {}
-    for name, values in given.conditions.items():
-        judging, named = _named(given, values)
+    for name, (judging, answers) in named.items():
         known = distances[name].corrected()[0][judging] <= np.log(beyond.balanced)
-        held[name] = HeldOut(judging, softmax(named / last), known)
+        held[name] = HeldOut(judging, softmax(answers / last), known)
     weight, bias = given.naming_head(np.ones(len(labels), bool))
     return Calibration(
         embedding,
@@ -292,8 +305,7 @@ def left_out(
     x, labels = given.whole, given.labels
     known, strangers, of_finished = (np.full(len(labels), np.nan) for _ in range(3))
     parts = 0
-    fitted = cross_fitted(x, labels, values, judged, given.fixed, given.beyond)
-    for seen, numbers, embedding, present in fitted:
+    for seen, numbers, embedding, present in given.cross_fitted(values, judged):
         shapes, without = view(seen, embedding, present)
         z, means = embedding(x[numbers]), embedding.means.astype(np.float64)
         known[numbers] = shaped_distances(z[:, None] - means, shapes).min(axis=1)
@@ -343,19 +355,20 @@ def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
     return np.concatenate(numbers), np.concatenate(logits)
 
 
-def _prefix_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
+def _prefix_logits(
+    given: CalibrationInputs, judging: Array, named: Array
+) -> tuple[Array, Array, float]:
     """Logits [n, D + 1, K] of the judged sweeps and their prefixes by heads that did not see their
     value of the hardest condition, at temperature 1; the numbers [n] of these sweeps; the
-    temperature of logits from class means."""
+    temperature of logits from class means. judging, named: of `_named` for this condition."""
     labels, groups = given.labels, given.groups
-    logits, numbers = fit_early.cross_fitted_logits(
-        given.prefixes, labels, groups, given.judged, given.fixed
-    )
+    parts = given.cross_fitted(groups, given.judged)
+    logits, numbers = fit_early.cross_fitted_logits(given.prefixes, labels, parts)
     temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])
     row_of = {number: row for row, number in enumerate(numbers)}
-    for number, named in zip(*_named(given, groups), strict=True):
+    for number, answers in zip(judging, named, strict=True):
         if number in row_of:
-            logits[row_of[number], -1] = named
+            logits[row_of[number], -1] = answers
     return logits, numbers, temperature
 
 

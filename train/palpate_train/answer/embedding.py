@@ -157,19 +157,20 @@ def embed(features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHIN
     x = np.asarray(features, np.float64)
     middle, size = x.mean(axis=0), x.shape[1]
     means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
-    white = _whitening(x, labels)
-    axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][
-        : classes - 1
-    ].T
+    covariance = _covariance(x, labels)
+    axes = covariance.orthonormal(_apart(covariance, means - means.mean(axis=0), classes - 1))
     if (room := min(len(beyond), size - fixed - classes)) > 0:
-        others = white.transposed(beyond - middle - means.mean(axis=0))
-        others -= others @ axes @ axes.T
-        axes = np.hstack([axes, np.linalg.svd(others, full_matrices=False)[2][:room].T])
-    orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
-    if fixed and axes.shape[1] + fixed < size:  # W times columns of its inverse selects features
-        directions, turn = white.apply(axes), np.linalg.inv(mixed)
+        others = beyond - middle - means.mean(axis=0)
+        others -= others @ axes @ covariance.times(axes).T
+        more = np.hstack([axes, _apart(covariance, others, room)])
+        axes = covariance.orthonormal(more)
+    last = np.arange(max(size - fixed, axes.shape[1]), size)
+    both = np.hstack([axes, np.eye(size)[:, last]])
+    turn = covariance.turn(both)
+    if fixed and both.shape[1] < size:
+        directions = axes
     else:
-        directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
+        directions, turn = both @ turn, np.eye(both.shape[1])
     # rounded as the graph of a bundle holds them
     (whole, steps), (turn, sizes) = sixteen_bits(directions), sixteen_bits(turn)
     bare = Embedding(whole * steps, turn * sizes, *[np.empty(0)] * 3)
@@ -276,42 +277,57 @@ def embed_present(
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitening:
-    """W [F, F] with W' C W = 1, where C is the covariance within materials: a diagonal matrix plus
-    a matrix of a few directions.
+class _Covariance:
+    """C = diagonal + rows' rows [F, F], the covariance within materials, with `rows` [n, F]. No
+    matrix of the size [F, F] is computed if there are fewer sweeps."""
 
-    C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of
-    R. directions: V [F, n], orthonormal; variances: the diagonal [n] of S. No matrix of the size
-    [F, F] is computed if there are fewer sweeps.
-    """
+    diagonal: Array
+    rows: Array
 
-    root: Array
-    directions: Array
-    variances: Array
+    def times(self, b: Array) -> Array:
+        """C times `b` [F, m]."""
+        product: Array = self.diagonal[:, None] * b + self.rows.T @ (self.rows @ b)
+        return product
 
-    def apply(self, b: Array) -> Array:
-        """W times `b` [F, m]."""
-        return self._power(b, -0.5) / self.root[:, None]
+    def solved(self, b: Array) -> Array:
+        """The inverse of C times `b` [F, m] (Woodbury's identity)."""
+        root = np.sqrt(self.diagonal)
+        scaled, b = self.rows / root, b / root[:, None]
+        if (n := len(scaled)) < len(root):
+            inner = np.linalg.solve(np.eye(n) + scaled @ scaled.T, scaled @ b)
+            x = b - scaled.T @ inner
+        else:
+            x = np.linalg.solve(np.eye(len(root)) + scaled.T @ scaled, b)
+        solution: Array = x / root[:, None]
+        return solution
 
-    def inverse(self, columns: slice) -> Array:
-        """Some columns of the inverse of W [F, m]."""
-        return self._power(np.eye(len(self.root))[:, columns] * self.root[columns], 0.5)
+    def turn(self, b: Array) -> Array:
+        """The upper matrix T [m, m] so that b @ T has the covariance 1, for `b` [F, m]."""
+        upper: Array = np.linalg.inv(np.linalg.cholesky(b.T @ self.times(b))).T
+        return upper
 
-    def transposed(self, b: Array) -> Array:
-        """`b` [m, F] times W."""
-        return self._power((b / self.root).T, -0.5).T
-
-    def _power(self, b: Array, power: float) -> Array:
-        """(1 + V S V') to this power times `b` [F, m]."""
-        factors = (1 + self.variances) ** power - 1
-        raised: Array = b + self.directions @ (factors[:, None] * (self.directions.T @ b))
-        return raised
+    def orthonormal(self, b: Array) -> Array:
+        """Directions [F, m] with the covariance 1 in which lies the same as in `b` [F, m]."""
+        return b @ self.turn(b)
 
 
-def _whitening(x: Array, labels: Array) -> _Whitening:
-    """The whitening for the covariance of LinearDiscriminantAnalysis(shrinkage="auto"): Ledoit and
-    Wolf's covariance of each material's features [n, F] at the same spread, averaged by the number
-    of sweeps. Few sweeps are shrunk by FEW_SHARE at least."""
+def _apart(covariance: _Covariance, means: Array, most: int) -> Array:
+    """The directions [F, m] in which `means` [K, F] are farthest from 0 for their scatter, at
+    `most`. Where means coincide, any directions take the place of the others."""
+    size = means.shape[1]
+    solved = covariance.solved(means.T)
+    squares, vectors = np.linalg.eigh(means @ solved)
+    most = min(most, size)
+    seen = np.flatnonzero(squares > FLAT * max(float(squares.max()), FLAT))[::-1][:most]
+    directions = solved @ (vectors[:, seen] / np.sqrt(squares[seen]))
+    others = np.random.default_rng(0).standard_normal((size, most - len(seen)))
+    return np.hstack([directions, others / np.sqrt(covariance.diagonal)[:, None]])
+
+
+def _covariance(x: Array, labels: Array) -> _Covariance:
+    """The covariance of LinearDiscriminantAnalysis(shrinkage="auto"): Ledoit and Wolf's covariance
+    of each material's features [n, F] at the same spread, averaged by the number of sweeps. Few
+    sweeps are shrunk by FEW_SHARE at least."""
     diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
@@ -320,16 +336,9 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
         share, mean = shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
         share = max(share, min(1.0, FEW_SHARE / max(len(z) - 1, 1)))
         diagonal += len(own) / len(x) * share * mean * spread**2
-        rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
-    root = np.sqrt(np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT)))
-    scattered = np.concatenate(rows) / root
-    few = len(scattered) < len(root)
-    variances, vectors = np.linalg.eigh(scattered @ scattered.T if few else scattered.T @ scattered)
-    seen = variances > FLAT * max(float(variances.max()), FLAT)
-    variances, vectors = variances[seen], vectors[:, seen]
-    return _Whitening(
-        root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances
-    )
+        rows.append(np.sqrt((1 - share) / len(x)) * away)
+    diagonal = np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT))
+    return _Covariance(diagonal, np.concatenate(rows))
 
 
 def centred(x: Array) -> tuple[Array, Array]:
@@ -359,6 +368,11 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
         yield part_of != part, np.flatnonzero((part_of == part) & judged)
 
 
+JudgingPart = tuple[Array, Array, Embedding, Array]
+"""The sweeps to fit to (bool [N]), the numbers of those that judge, the embedding, and the labels
+[K] of its means."""
+
+
 def cross_fitted(
     features: Array,
     labels: Array,
@@ -366,9 +380,9 @@ def cross_fitted(
     judged: Array,
     fixed: int = 0,
     beyond: Array = NOTHING,
-) -> Iterator[tuple[Array, Array, Embedding, Array]]:
-    """For each of `parts` the pair that it yields, the embedding of the sweeps to fit to, and the
-    labels [K] of its means. Sweeps of a material that occurs in no other part do not judge."""
+) -> Iterator[JudgingPart]:
+    """A JudgingPart for each of `parts`. Sweeps of a material that occurs in no other part do not
+    judge."""
     for fit, numbers in parts(groups, judged):
         embedding, present = embed_present(features[fit], labels[fit], fixed, beyond)
         yield fit, numbers[np.isin(labels[numbers], present)], embedding, present

@@ -7,6 +7,7 @@ did not see; without a sufficient probability the box does not answer early.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from palpate.answer.early import Early
 from palpate.answer.unknown import EarlyClasses, EarlyDistances
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
-from palpate_train.answer.embedding import centred, cross_fitted, limit
+from palpate_train.answer.embedding import JudgingPart, centred, limit
 from palpate_train.answer.heads import ABSENT, shrinkage
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import sufficient_temperature
@@ -148,17 +149,15 @@ def _covariance(x: Array) -> Array:
 
 
 def cross_fitted_logits(
-    tenths: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+    tenths: Array, labels: Array, parts: Iterable[JudgingPart]
 ) -> tuple[Array, Array]:
     """Logits [n, D + 1, K] of each prefix and the whole window at temperature 1, and the numbers
     [n] of their sweeps.
 
-    prefixes: features [N, D + 1, F]. Each sweep of `judged` (bool [N]) is judged by an embedding
-    and heads that did not see its group (int [N]). Sweeps of a material that occurs in no other
-    part are left out. Raises FormatError as embedding.parts.
+    tenths: features [N, D + 1, F]. Each sweep is judged by the embedding of its part, see
+    embedding.cross_fitted, and by heads of the sweeps that this was fitted to.
     """
     classes, logits, numbers = int(labels.max()) + 1, [], []
-    parts = cross_fitted(tenths[:, -1], labels, groups, judged, fixed)
     for fit, judges, embedding, present in parts:
         z = embedding(tenths)
         steps = heads(z[fit], labels[fit], classes).logits(z[judges])

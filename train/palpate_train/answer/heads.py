@@ -16,8 +16,9 @@ together they are still one matrix.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -62,17 +63,27 @@ class HeadPart:
 
 @dataclass(frozen=True, eq=False)
 class HeadData:
-    """Sweeps that a head is fitted to. features: [N, F], labels [N]. copied: [M, F] of augmented
-    copies; source: the number [M] of the sweep of each copy. conditions: int [N, C], the value of
-    each condition that can be new in service. weights: [N], how much each sweep counts with its
-    copies; None if all count alike."""
+    """Sweeps that a head is fitted to. features: [N, F], labels [N]. of_copies: gives the features
+    [M, F] of augmented copies, called when a head first sees them; source: the number [M] of the
+    sweep of each copy. conditions: int [N, C], the value of each condition that can be new in
+    service. weights: [N], how much each sweep counts with its copies; None if all count alike."""
 
     features: Array
     labels: Array
-    copied: Array
+    of_copies: Callable[[], Array]
     source: Array
     conditions: Array
     weights: Array | None = None
+
+    @cached_property
+    def copied(self) -> Array:
+        """Features [M, F] of augmented copies."""
+        return self.of_copies()
+
+    @property
+    def drawn(self) -> bool:
+        """Whether a head has seen copies."""
+        return "copied" in vars(self)
 
     def take(self, kept: Array) -> HeadData:
         """The sweeps `kept` (mask) and their copies."""
@@ -81,7 +92,7 @@ class HeadData:
         return HeadData(
             self.features[kept],
             self.labels[kept],
-            self.copied[also],
+            lambda: self.copied[also],
             position[self.source[also]],
             self.conditions[kept],
             None if self.weights is None else self.weights[kept],
@@ -89,12 +100,14 @@ class HeadData:
 
     def seen(self, columns: Array) -> HeadData:
         """The features of these numbers alone."""
-        return replace(self, features=self.features[:, columns], copied=self.copied[:, columns])
+        seen = self.features[:, columns]
+        return replace(self, features=seen, of_copies=lambda: self.copied[:, columns])
 
     def beside(self, other: HeadData) -> HeadData:
         """These features, then those of `other`, for the same sweeps and copies."""
         features = np.hstack([self.features, other.features])
-        return replace(self, features=features, copied=np.hstack([self.copied, other.copied]))
+        of_both = lambda: np.hstack([self.copied, other.copied])  # noqa: E731
+        return replace(self, features=features, of_copies=of_both)
 
 
 def condition_values(groups: Mapping[str, Array], count: int) -> Array:

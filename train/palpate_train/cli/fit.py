@@ -205,7 +205,8 @@ def run_fit(args: argparse.Namespace) -> None:
         change.of(rest).save(args.rest)
         made = replace(made, about=made.about | {"rest": str(args.rest)})
     made.save(args.out)
-    shutil.rmtree(unfinished, ignore_errors=True)
+    if unfinished:
+        shutil.rmtree(unfinished, ignore_errors=True)
     of = f", {len(made.train)} of them to train stages" if made.architecture.channels else ""
     say(f"fit: {made.sweeps} sweeps{of}, {made.train.format}; {args.out}")
     if len(sweeps) > args.most_sweeps:
@@ -267,11 +268,11 @@ def _check(args: argparse.Namespace) -> None:
             options.writable_file(path, f"--{option}", *endings)
 
 
-def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
-    """The fit for these options, the reduction of its sweeps, and the folder that keeps its
-    training until the fit is written."""
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path | None]:
+    """The fit for these options, the reduction of its sweeps, and the folder that keeps the
+    training of stages until the fit is written."""
     use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
-    log, unfinished = options.Log(), _unfinished(args, sweeps, use)
+    log, unfinished = options.Log(), _unfinished(args, sweeps, use) if args.steps else None
     run = Run(args.seed, log, unfinished)
     settings = recipe.Settings(
         args.steps,

@@ -12,12 +12,11 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from palpate.core import storage
 from palpate.core.errors import FormatError
 from palpate_train.data.sets import Dataset
 from palpate_train.models.linear_head import hold_out
 from palpate_train.models.methods import Method, Model, model_inputs
-from palpate_train.models.recipe.fitted import WHAT, read_sides, sides_of
+from palpate_train.models.recipe.fitted import WHAT, read_sides, sides_of, write
 
 Array = NDArray[Any]
 
@@ -58,9 +57,7 @@ class MethodFit:
         arrays, meta = sides_of(self.train, self.held)
         arrays |= {k: np.frombuffer(v.SerializeToString(), np.uint8) for k, v in graphs.items()}
         meta |= {"input": self.input, "held_out_by": self.held_out_by, "about": self.about}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with storage.file(path) as f:
-            np.savez_compressed(f, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+        write(path, arrays, meta)
 
     @classmethod
     def read(cls, name: str, arrays: Mapping[str, Array]) -> Self:

@@ -58,7 +58,13 @@ from palpate_train.models.recipe import (
 )
 from palpate_train.models.recipe.architectures import MAINS_HZ, STAGES, Architecture
 from palpate_train.models.recipe.bank import Bank
-from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
+from palpate_train.models.recipe.choice import (
+    ENOUGH,
+    Candidates,
+    FeatureColumns,
+    HeldOutScores,
+    ScoredPlan,
+)
 from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.models.recipe.memory import MOST_SWEEPS
 from palpate_train.models.recipe.sizes import UNLIMITED, ModelSize
@@ -73,9 +79,6 @@ PARTS = "features", "choice of the model", "training of stages"
 """Parts of a fit, for its progress."""
 STAGE_STEPS = 600
 """Steps of the training of stages where nobody says another number."""
-ENOUGH = 0.99
-"""Accuracy on held-out parts from which on stages improve too little for their share of the
-bundle's size and time."""
 FIXED = Architecture((), planned=len(STAGES.channels))
 """A trunk without stages that prepares counts as a trunk with STAGES does."""
 
@@ -149,7 +152,7 @@ class Setup:
     @cached_property
     def fixed(self) -> FixedFeatures:
         """Step 1: the features that need no training."""
-        self.part(1)(f"features of {len(self.sweeps)} sweeps and {COPIES} copies of each")
+        self.part(1)(f"features of {len(self.sweeps)} sweeps")
         trunk = fixed_trunk(self.sweeps, self.run.seed, self.settings.use.mains_hz)
         scales = trunk.architecture.relations
         columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
@@ -227,13 +230,11 @@ class Setup:
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
-        of_copies = [trunk.features(one, int8) for one in self.copies]
-        source = np.tile(np.arange(len(self.sweeps)), len(self.copies))
         return HeadData(
             trunk.features(self.sweeps, int8),
             self.sweeps.labels,
-            np.concatenate(of_copies),
-            source,
+            lambda: np.concatenate([trunk.features(one, int8) for one in self.copies]),
+            np.tile(np.arange(len(self.sweeps)), COPIES),
             self.values,
             self.sweeps.groups.get(WEIGHT),
         )
@@ -392,7 +393,8 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
     fixed, chosen = setup.fixed, judged.chosen.plan
     trunk, plan = pruned(fixed.trunk, stages, chosen)
     known = setup.stages[1].beside(fixed.data) if stages else fixed.data
-    for name, data in (("head", setup.data(trunk, False)), ("int8", known.seen(chosen.columns()))):
+    columns = chosen.columns()
+    for name, data in (("head", setup.data(trunk, False)), ("int8", known.seen(columns))):
         weight, bias = plan.fit(data, classes)
         heads[f"{name}.weight"] = weight - weight.mean(axis=0)
         heads[f"{name}.bias"] = bias - bias.mean()
@@ -418,7 +420,10 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
         about,
         plan=plan.uncooled(),
     )
-    return finished(made) if settings.calibrate else made
+    if not settings.calibrate:
+        return made
+    drawn = fixed.data.drawn and setup.judging.group != "nothing"
+    return finished(made, known.seen(columns).take(~setup.judging.out) if drawn else None)
 
 
 def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk:
