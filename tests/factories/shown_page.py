@@ -25,7 +25,7 @@ def four_hours_ago() -> str:
 class Shown:
     """A page whose lines a test writes; within `with` browsers learn fast of a lost box."""
 
-    def __init__(self, access: Access, finger: str = "", memory: Path = NO_FILE) -> None:
+    def __init__(self, access: Access, memory: Path = NO_FILE) -> None:
         self.history, self.boxes = History(memory, four_hours_ago()), list[dict[str, str]]()
         self.server = PageServer(
             "watch.html",
@@ -34,7 +34,7 @@ class Shown:
             KEPT,
             self._answers(),
         )
-        self.board = PageBoard(self._publish, finger)
+        self.board = PageBoard(self._publish)
         self._box: object = None
         self._ended = threading.Event()
         self._beating = threading.Thread(target=self._beat)

@@ -3,14 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import re
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import pynmea2
@@ -23,8 +15,6 @@ from palpate.core import sentences
 from palpate.core.errors import ConfigError
 from palpate.sim.rig import VirtualClock
 from tests.factories import feed_lines
-from tests.factories.feeds import OK, Offered
-from tests.factories.paths import ROOT
 
 LABELS = feed_lines.LABELS
 FAULT = {"scores": [], "label": "", "probability": 0.0, "fused": 0}
@@ -220,36 +210,3 @@ def test_which_fingers_is_checked(given):
     with pytest.raises(ConfigError):
         command.feeds(given.split())
     assert str(command.feeds(["a", "b=/x"])["a"].path) == "/run/palpate-a/feed.sock"
-
-
-@pytest.fixture
-def units(tmp_path: Path) -> Iterator[dict[str, Offered]]:
-    """The feeds of two units, which turn as the test does."""
-    with ExitStack() as stack:
-        made = {name: Offered(tmp_path / name) for name in ("left", "right")}
-        for one in made.values():
-            stack.callback(one.feed.stopping)
-            one.turns()
-        yield made
-
-
-def test_the_program_reads_the_feeds(units):
-    """From the feeds of two boxes to sentences, until SIGTERM; a busy machine may fuse one."""
-    both = re.compile(rb"(\$PPLP,FIN.*\r\n){2}\$PPLP,RES")
-    fingers = [f"{name}={one.path}" for name, one in units.items()]
-    words = [sys.executable, "-m", "palpate.bridges", "fuse", "--fingers", *fingers]
-    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE) as bridge:
-        assert bridge.stdout
-        os.set_blocking(bridge.stdout.fileno(), False)
-        heard = b""
-        for _ in range(6000):  # a busy machine is slow; no more than that
-            for one in units.values():
-                one.turns()
-                one.feed.answered(OK)
-            heard += bridge.stdout.read() or b""
-            if both.search(heard) or bridge.poll() is not None:
-                break
-            threading.Event().wait(0.01)
-        bridge.terminate()
-        assert bridge.wait(60) == 0
-    assert both.search(heard), heard

@@ -84,7 +84,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
 
 
 def test_a_good_pair_is_answered_as_one_hand(pair: Pair):
-    """Both fingers are answered, then the hand, without a word about a fault."""
+    """Both fingers are answered, then the hand, without a word about a fault, until SIGTERM."""
     bridge = pair.hand()
     assert bridge.stdout
     answers: list[tuple[str, Answer]] = []
@@ -101,6 +101,8 @@ def test_a_good_pair_is_answered_as_one_hand(pair: Pair):
     left, right, hand = (answer for _, answer in last)
     assert {left.label, right.label} >= {hand.label}
     assert hand.detail == ""
+    bridge.terminate()
+    assert bridge.wait(LIMIT_S) == 0
 
 
 @pytest.mark.parametrize("name", FINGERS)

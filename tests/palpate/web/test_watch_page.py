@@ -131,6 +131,7 @@ def test_a_large_skin_is_drawn_without_numbers(browser, shown, width, height):
         shown.board.take(feed_lines.frame(380 + i / 20, taxels))
     seen = opened(browser, shown, width, height)
     until(lambda: seen.page.locator(".tile").count() == 12 * 32)
+    assert seen.text("#skin-title") == "Skin"  # of the only finger
     assert seen.page.locator(".count").count() == 0
     boxes = [one.bounding_box() for one in seen.page.locator("svg .name").all()]
     assert len(boxes) == 4 + 9 + 1

@@ -137,17 +137,6 @@ def test_each_state_is_told_from_two_metres(browser, shown, width, height, schem
     context.close()
 
 
-def test_the_page_of_a_finger_says_which_one(browser: Any):
-    """A robot with two has two pages, and they look alike."""
-    for finger, title in (("left", "Skin of left"), ("", "Skin")):
-        with Shown(Access(0), finger) as one:
-            one.shift()
-            seen = opened(browser, one)
-            until(lambda seen=seen: seen.page.locator(".skin .tile").count() == 16)
-            assert seen.text("#skin-title") == title
-            seen.page.context.close()
-
-
 def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
     """The name of a material that the box does not answer for is never the large word."""
     seen = opened(browser, shown)
