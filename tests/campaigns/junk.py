@@ -8,7 +8,7 @@ of two materials, or of none, is wrong under any label. Takes some minutes.
 import argparse
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,10 @@ class SweepDraw:
         return str(self.rng.choice([m for m in skin.MATERIALS if m != material]))
 
 
+LEAST_PROPERTY = 0.005
+"""A property below it is as good as absent."""
+OTHER_SKIN = {"counts_per_kpa": 12.0, "damping_hz": 80.0, "noise_counts": 1.64}
+"""A fifth less sensitive, twice the noise, more damping."""
 Make = Callable[[SweepDraw, str], Counts]
 """Raw counts [T, R, C], not yet rounded, of a scene and a material."""
 Wave = Callable[[SweepDraw], Counts]
@@ -245,6 +249,46 @@ def random_material(scene: SweepDraw) -> skin.Material:
     return _varied(scene, one, other, 1 / 3)
 
 
+def one_property(name: str) -> Make:
+    """A known material of which one property alone is half larger, or a third smaller."""
+
+    def draw(scene: SweepDraw) -> skin.Material:
+        has = [tube for tube in scene.world.tubes if getattr(tube, name) > LEAST_PROPERTY]
+        known = has[int(scene.rng.integers(len(has)))]
+        factor = 1.5 if scene.rng.random() < 0.5 else 1 / 1.5
+        return replace(known, name="untaught", **{name: factor * getattr(known, name)})
+
+    return untaught(draw)
+
+
+def halfway(scene: SweepDraw) -> skin.Material:
+    """Each property halfway between those of two known materials."""
+    two = [scene.world.tube(str(name)) for name in scene.rng.choice(skin.MATERIALS, 2, False)]
+    names = [part.name for part in fields(skin.Material) if part.name != "name"]
+    middle = {name: float(np.mean([getattr(one, name) for one in two])) for name in names}
+    return skin.Material("untaught", **middle)
+
+
+def beside(make: Make, wave: Wave, share: float) -> Make:
+    """A sweep and a wave of `share` of its own deviations."""
+
+    def made(scene: SweepDraw, material: str) -> Counts:
+        x = make(scene, material)
+        return x + share * strength(x) * wave(scene)
+
+    return made
+
+
+def elsewhere(make: Make, **changed: float) -> Make:
+    """A sweep in a world with other parameters."""
+
+    def made(scene: SweepDraw, material: str) -> Counts:
+        world = replace(scene.world, **changed)  # type: ignore[arg-type]
+        return make(SweepDraw(world, scene.rng), material)
+
+    return made
+
+
 def _varied(
     scene: SweepDraw, one: skin.Material, other: skin.Material, share: float
 ) -> skin.Material:
@@ -262,6 +306,16 @@ UNTAUGHT: dict[str, Make] = {
     "material near foam": untaught(near_foam),
     "felt": untaught(felt),
     "random material": untaught(random_material),
+}
+HARDER: dict[str, Make] = {
+    "softness alone": one_property("softness_mm_per_kpa"),
+    "roughness alone": one_property("texture_mm"),
+    "vibration alone": one_property("vibration"),
+    "halfway between two": untaught(halfway),
+    "random material, 50 Hz hum": beside(untaught(random_material), sine(50), 0.5),
+    "random material, noise": beside(untaught(random_material), white(4), 0.5),
+    "random material, 35 % faster": elsewhere(untaught(random_material), speed=1.35),
+    "random material, other skin": elsewhere(untaught(random_material), **OTHER_SKIN),
 }
 COUNTED = "whole", "whole wrong", "early", "early wrong"
 NAMELESS: dict[str, Make] = {
@@ -328,8 +382,9 @@ GROUPS = {
     "no material, or no slide": NAMELESS,
     "slides that were altered": ALTERED,
     "materials that nobody taught": UNTAUGHT,
+    "untaught materials, made harder": HARDER,
 }
-KINDS = NAMELESS | ALTERED | UNTAUGHT
+KINDS = NAMELESS | ALTERED | UNTAUGHT | HARDER
 """How to draw a sweep of each kind. Only in altered slides the label of the material is right."""
 
 
@@ -348,13 +403,16 @@ def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) 
     return (early and first_answer(early, whole)) or box(whole)
 
 
-def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dict[str, Any]]:
-    """Prints and returns the sweeps, labels and wrong labels of each kind, whole and early."""
+def counted(
+    model: bundle.Bundle, world: skin.World, each: int, wanted: Iterable[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """Prints and returns the sweeps, labels and wrong labels of each kind, whole and early. wanted:
+    the kinds, all without any."""
     box = Classifier(model, VirtualClock())
     early = EarlyExit(box) if model.manifest.early else None
     print(f"{'of ' + str(each):32} whole: ok, wrong; early: ok, wrong; most frequent status")
     kinds = {}
-    for name in KINDS:
+    for name in wanted or KINDS:
         found, statuses = Counter[str](), Counter[str]()
         for number in range(each):
             taxels, right = window(name, world, number)
@@ -405,6 +463,7 @@ def main() -> None:
     """Count, write the figures, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns junk", description=__doc__)
     parser.add_argument("--each", type=int, default=EACH, help="sweeps of a kind (default: 200)")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, help="count only these")
     parser.add_argument("--bundle", type=Path, default=bundle.DEFAULT)
     parser.add_argument("--world", choices=skin.WORLDS, default="level-blind")
     parser.add_argument("--out", type=Path, default=Path("build/junk.json"))
@@ -412,8 +471,12 @@ def main() -> None:
     options = parser.parse_args()
     if not options.draw:
         model = bundle.load(options.bundle)
-        kinds = counted(model, skin.WORLDS[options.world], options.each)
-        content = {"commit": commit(), "bundle": model.id, "world": options.world, "kinds": kinds}
+        made = {"commit": commit(), "bundle": model.id, "world": options.world}
+        kinds = counted(model, skin.WORLDS[options.world], options.each, options.kinds)
+        content = made | {"kinds": kinds}
+        if options.kinds:
+            content = json.loads(options.out.read_text("utf-8"))
+            content["kinds"] |= {name: found | made for name, found in kinds.items()}
         storage.put(options.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
     content = json.loads(options.out.read_text("utf-8"))
     print(table(content))

@@ -36,8 +36,8 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
 HOWS = ("kill", "power", "kill_then_power", "timed")
 
 
-def main() -> int:
-    """Cut the named scenes, or all scenes."""
+def _given() -> argparse.Namespace:
+    """The arguments; ends the program for a scene that does not exist."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.cuts", description=__doc__.split("\n\n")[0]
     )
@@ -61,6 +61,12 @@ def main() -> int:
     given = parser.parse_args()
     if wrong := set(given.scenes) - set(SCENES):
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
+    return given
+
+
+def main() -> int:
+    """Cut the named scenes, or all scenes."""
+    given = _given()
     if lack := calls.lacking():
         sys.exit(f"cuts: needs {lack}")
     given.out.parent.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,8 @@ from tests.factories.skins.wires import wire
 
 PITCHES = {"oak": 0.04, "cork": 0.1, "felt": 0.19, "slate": 0.33}
 """Materials, with the frequency of each in periods per frame."""
+OTHER = 0.26
+"""The frequency of anything else."""
 RATE_HZ, WINDOW_S, SLIDE_S = 100.0, 0.64, 0.9
 START_S = 60
 
@@ -36,7 +38,7 @@ class SlidSkin:
         noise = self._rng.standard_normal((4, 4))
         if not self.material:
             return (20 + noise).round().astype(np.uint8)
-        self._phase += 2 * np.pi * PITCHES[self.material] * self._rng.uniform(0.9, 1.1)
+        self._phase += 2 * np.pi * PITCHES.get(self.material, OTHER) * self._rng.uniform(0.9, 1.1)
         rows = np.arange(4)[:, None] * 0.4
         return (120 + 30 * np.sin(self._phase + rows) + 2 * noise).round().astype(np.uint8)
 

@@ -346,11 +346,12 @@ class ClassDistances:
         distances: Array = shaped_distances(away, self._shapes).mean(axis=-1) / 2
         return distances
 
-    def closest_pair(self) -> float:
-        """Squared distance between the two closest class means."""
+    def closest_pair(self) -> tuple[float, str, str]:
+        """The squared distance between the two closest class means, and their labels."""
         away = self._means[:, None] - self._means
-        between = (away**2).sum(axis=-1)
-        return float(between[~np.eye(len(between), dtype=bool)].min())
+        between = (away**2).sum(axis=-1) + np.diag(np.full(len(away), np.inf))
+        first, second = divmod(int(between.argmin()), len(between))
+        return float(between[first, second]), self.labels[first], self.labels[second]
 
 
 class KnownMaterial:

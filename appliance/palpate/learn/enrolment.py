@@ -194,7 +194,7 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
     # minus the expected squared error of a mean of n sweeps
     to_old = means.distances(z.mean(axis=0)) - r / n
     k = int(to_old.argmin())
-    if to_old[k] >= min(means.loose, means.closest_pair()):
+    if to_old[k] >= min(means.loose, means.closest_pair()[0]):
         return ""
     close = f"squared distance {max(to_old[k], 0):.1f}, limit {means.loose:.1f}"
     return f"{label!r} lies close to {means.labels[k]!r} ({close}) and will often be called that"

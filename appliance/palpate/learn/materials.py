@@ -65,7 +65,7 @@ def trained(running: Bundle) -> tuple[str, ...]:
 
 def recorded(running: Bundle, folder: Path) -> NewSweeps:
     """The sweeps in `folder` of new materials and of the format of the bundle."""
-    check, known = enrolment.slide_check(running), trained(running)
+    check, known = enrolment.slide_check(running), (*trained(running), sweep_folder.NOT_THIS)
     taught = sweep_folder.taught(folder, Counter())
     ours = [one for one in taught if one.format == running.format]
     new = [one for one in ours if one.sweep.material not in known]

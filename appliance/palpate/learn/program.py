@@ -24,6 +24,7 @@ from palpate.core.names import TypedNames
 from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import CommandHandler, Reply
 from palpate.core.types import Sweep, SweepFormat
+from palpate.inference.classifier import class_distances
 from palpate.io.robot_link import Command
 from palpate.io.verdict_lines import check_bits
 from palpate.learn import install, materials
@@ -35,6 +36,7 @@ from palpate.runtime.reporting import capture, feed, status
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
+from palpate.sweeps.sweep_folder import NOT_THIS
 
 NOTHING, GOOD = "nothing taught yet", 8
 """The model of a box that is being taught, in status and feed; and its wanted number of sweeps."""
@@ -230,6 +232,8 @@ class TryingPhase(Phase):
         for one in trial:
             one.disk = disk
         self._bundle, m = choice.bundle, choice.bundle.manifest
+        means = class_distances(choice.bundle, settings.classifier.strangers)
+        self._alike = means.closest_pair()[1:] if means else ()
         port = assembly.port(settings, program.devices, terminal=False)
         facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
         again = {"TEACH": self._teach_again}
@@ -248,7 +252,7 @@ class TryingPhase(Phase):
         m = self._bundle.manifest
         taught = m.taught or f"taught into it: {', '.join(self._bundle.enrolled)}"
         shown = {"model": f"{m.name} {m.version}", "labels": m.labels, "displays": m.displays}
-        return {"trying": shown | {"taught": taught}}
+        return {"trying": shown | {"taught": taught, "alike": self._alike}}
 
     def run(self) -> bool:
         """Run; returns whether more is to be taught."""
@@ -263,6 +267,7 @@ class TryingPhase(Phase):
         refuse_trained(self._program.trained, [label])
         if self._program.codes:
             labels = dict.fromkeys((*self._bundle.manifest.labels, label))
+            labels.pop(NOT_THIS, None)
             check_bits(self._program.codes, [*labels])
         self._program.again = label
         return [label]

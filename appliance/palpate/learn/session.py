@@ -24,7 +24,7 @@ from palpate.core.types import Sweep, Verdict
 from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_folder import number_of
+from palpate.sweeps.sweep_folder import NOT_THIS, number_of
 
 FEWEST_TAUGHT = 2
 """Fewest sweeps of a material that can be assessed, and fewest such materials."""
@@ -39,7 +39,14 @@ of a process that only assesses the sweeps."""
 
 
 def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
-    """Raises ConfigError for a label that the delivered bundle was trained on."""
+    """Raises ConfigError for a label that the delivered bundle was trained on, and for sweeps that
+    would move its limits."""
+    trained, labels = tuple(trained), tuple(labels)
+    if trained and NOT_THIS in labels:
+        raise ConfigError(
+            f"a delivered bundle keeps its limits, and {NOT_THIS!r} cannot move them; set "
+            'classifier.strangers = "strict"'
+        )
     if known := next((name for name in labels if name in trained), ""):
         advice = "record it for the desktop (palpate record), or take another name"
         raise ConfigError(f"the bundle in service was trained on {known!r}; {advice}")
@@ -118,6 +125,10 @@ class TeachingSession(Observer):
         counts = {name: n for name, n in counts.items() if name not in self._trained}
         return dict.fromkeys(self._named, 0) | counts
 
+    def _taught(self) -> dict[str, int]:
+        """`materials` that an answer may name."""
+        return {name: n for name, n in self.materials().items() if name != NOT_THIS}
+
     @property
     def _kept(self) -> tuple[int, int | None]:
         """Another pair after each sweep that was stored or discarded."""
@@ -138,7 +149,8 @@ class TeachingSession(Observer):
         refuse_trained(self._trained, labels)
         if self._codes:
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
-            wanted.pop(renamed, None)
+            for name in (renamed, NOT_THIS):
+                wanted.pop(name, None)
             for name in self._recording.forgotten - self.materials().keys() - {*labels}:
                 if name not in self._trained:
                     wanted.pop(name, None)
@@ -164,7 +176,7 @@ class TeachingSession(Observer):
                 self._process, self._using, self._step = None, False, None
         elif self._due_ns is not None and self._clock.now_ns() >= self._due_ns:
             self._due_ns = None
-            if sum(n >= FEWEST_TAUGHT for n in self.materials().values()) >= self._fewest:
+            if sum(n >= FEWEST_TAUGHT for n in self._taught().values()) >= self._fewest:
                 self._assess()
             else:
                 self._learnt = None
@@ -262,7 +274,7 @@ class TeachingSession(Observer):
         if self._using:
             raise ApplianceError("a bundle is being made already; wait for TCH")
         self._recording.refuse_while_changing()
-        held = {name: n for name, n in self.materials().items() if n}
+        held = {name: n for name, n in self._taught().items() if n}
         if len(held) < self._fewest:
             why = "teach one" if self._base else "a model tells at least two apart: teach another"
             raise ApplianceError(f"{len(held)} materials have sweeps; {why}")

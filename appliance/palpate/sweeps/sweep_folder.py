@@ -134,6 +134,10 @@ def last_format(folder: Path) -> SweepFormat | None:
     return None
 
 
+NOT_THIS = "not this"
+"""Material of sweeps over other things, which show a taught model what is unknown."""
+
+
 @dataclass(frozen=True, slots=True)
 class NoSlide:
     """A sweep that is not a slide. number: of its file. text: with the reason."""

@@ -24,6 +24,7 @@ from palpate.learn.process import TeachingProcess
 from palpate.learn.session import Teacher, TeachingSession
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import NOT_THIS
 from tests.factories.feeds import HEALTH, OK, cut
 from tests.factories.slow_disk import SlowDisk
 
@@ -112,11 +113,16 @@ def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught):
 
 
 def test_sweeps_without_a_fault_of_two_materials_are_needed(taught):
-    """Faulty ones are stored, neither counted nor taught; one material is refused."""
+    """Faulty ones are stored, neither counted nor taught; one material is refused, with sweeps of
+    something else beside it, too."""
     taught.sweeps("cork", 2)
     taught.sweeps("cork", 2, Status.NO_CONTACT)
     assert taught.session.materials() == {"cork": 2}
     taught.sweeps("cork", 5)
+    taught.sweeps(NOT_THIS, 3)
+    assert taught.session.materials() == {"cork": 7, NOT_THIS: 3}
+    about = taught.until(lambda about: not about["assessing"])
+    assert about["learnt"] is None
     with pytest.raises(ApplianceError, match=r"1 materials"):
         taught.order("USE")
 
@@ -247,6 +253,13 @@ def test_a_label_that_cannot_be_sent_is_refused(taught, label):
     assert taught.session.materials() == {}
 
 
+def test_a_delivered_bundle_keeps_its_limits():
+    """Sweeps of something else are refused beside one, and taken without."""
+    with pytest.raises(ConfigError, match=NOT_THIS):
+        session.refuse_trained(("oak",), [NOT_THIS])
+    session.refuse_trained((), [NOT_THIS])
+
+
 def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     """By TEACH; or at the start, until one is forgotten."""
     narrow = Taught(tmp_path, codes=4)
@@ -256,7 +269,8 @@ def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     with pytest.raises(ConfigError, match=r"4 labels"):
         narrow.order("TEACH", "oak")
     assert narrow.order("TEACH", "felt") == ["felt", 1]
-    assert narrow.session.materials() == {"cork": 1, "pine": 1, "felt": 1}
+    assert narrow.order("TEACH", NOT_THIS) == [NOT_THIS, 0]  # nothing that is sent
+    assert narrow.session.materials() == {NOT_THIS: 0, "cork": 1, "pine": 1, "felt": 1}
     narrow.recording.close()
     narrower = Taught(tmp_path, codes=2)
     assert narrower.session.about()["trouble"].endswith("forget a material")

@@ -14,6 +14,7 @@ import pytest
 
 from palpate.client.feed import Feed
 from palpate.core.config import FEED
+from palpate.sweeps.sweep_folder import NOT_THIS
 from tests.factories import deliveries
 from tests.factories.browser import BrowsedPage, until
 from tests.factories.taught_skin import PITCHES, SLIDE_S, TaughtBox, taught_box
@@ -99,6 +100,10 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser, box):
             hand.slide(material)
             if "enough" in hand.seen.text("#count"):
                 break
+    hand.press("#other")
+    hand.until("#what", lambda text: text == NOT_THIS)
+    hand.slide("glass")
+    hand.until("#materials", lambda text: f"{NOT_THIS}: 1" in text)
     learnt = re.compile(r" of (\d+) sweeps ")
     hand.until("#learnt", lambda text: any(int(n) >= 4 * EACH for n in learnt.findall(text)))
     assert "between" in hand.seen.text("#accuracy")
@@ -106,7 +111,8 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser, box):
     hand.press("#use")
     hand.page.wait_for_selector("#done:visible")
     waited = time.monotonic() - begun
-    assert "taught" in hand.seen.text("#learnt")
+    assert "taught" in (learnt_of := hand.seen.text("#learnt"))
+    assert sum(material in learnt_of for material in PITCHES) == 2  # most alike
     assert (box.folder / "enrolment" / "key").exists()  # the bench had none
     with Feed(box.folder / "run" / FEED) as feed:
         hello = feed.read(60)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from palpate.answer.unknown import Known
 from palpate.core.errors import BundleError, FormatError
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import stranger_limits
 from palpate_train.answer.stranger_limits import COSTS, LeftOut, limits, nearest_other
 
@@ -141,10 +142,26 @@ def test_limits_that_fall_are_refused():
 
 
 @pytest.mark.parametrize("name", ["strict", "balanced"])
-def test_junk_between_known_and_unknown_materials_narrows_a_limit(name: str):
-    """Where no unknown material is near, junk that is nearer decides; known sweeps stay within."""
+@pytest.mark.parametrize("kind", ["rests", NOT_THIS])
+def test_other_things_between_known_and_unknown_materials_narrow_a_limit(name: str, kind: str):
+    """Where no unknown material is near, junk or sweeps of something else decide; known sweeps stay
+    within. Only the latter are told, by their number."""
     sweeps, rng = {"force": left_out(400, apart=12.0)}, np.random.default_rng(1)
     alone = limits(sweeps)
-    beside = limits(sweeps, junk={"rests": np.exp(rng.normal(1.2, 0.2, 60))})
+    beside = limits(sweeps, junk={kind: np.exp(rng.normal(1.2, 0.2, 60))})
     assert getattr(beside, name) < getattr(alone, name)
     assert beside.figures[name]["answered"][0] > 0.8
+    told = stranger_limits.lines({stranger_limits.FIGURES: beside.figures}, name)
+    assert any("60" in line for line in told) == (kind == NOT_THIS)
+
+
+def test_each_condition_has_a_curve_with_three_points():
+    """Both shares rise along it; a condition that scatters more lets fewer known sweeps pass."""
+    found = limits({"force": left_out(400), "speed": left_out(400, inflated=1.0, parts=20)})
+    by_condition = found.figures["by condition"]
+    assert by_condition.keys() == {"force", "speed"}
+    for of in by_condition.values():
+        curve, points = np.array(of["curve"]), np.array([of[name][0] for name in COSTS])
+        assert (np.diff(curve, axis=0) >= 0).all()
+        assert (np.diff(points, axis=0) >= 0).all()
+    assert by_condition["speed"]["balanced"][0][0] < by_condition["force"]["balanced"][0][0]

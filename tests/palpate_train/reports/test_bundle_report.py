@@ -14,7 +14,7 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
-from palpate_train.answer.stranger_limits import COSTS
+from palpate_train.answer.stranger_limits import COSTS, FIGURES
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
@@ -240,6 +240,18 @@ def test_the_page_shows_the_curve_and_materials_left_out(figures: dict, sweeps: 
     assert re.search(r"wood 25.0 % 95.0 % .*9 / 4", text)
     assert "known sweeps answered" in page
     assert all(f'classifier.strangers = "{limit}"' in text for limit in COSTS)
+
+
+def test_each_condition_has_its_curve(figures: dict):
+    """Of several conditions each is drawn, with a point for each limit; else their sum."""
+    found = dict(figures["figures"][FIGURES])
+    one = bundle_report.strangers(found)
+    shares = {limit: [[0.9, 0.2]] for limit in COSTS} | {"curve": [[0.6, 0.1], [0.95, 0.4]]}
+    two = bundle_report.strangers(found | {"by condition": {"force": shares, "speed": shares}})
+    assert "new force" in two
+    assert "new speed" in two
+    for limit in COSTS:
+        assert (one.count(f">{limit}<"), two.count(f">{limit}<")) == (1, 2)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 from palpate.core.errors import FormatError
 from palpate.core.types import Status, SweepFormat
 from palpate.sim import skin
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.data.sets import Dataset
 from palpate_train.teach.lesson import Lesson
 from tests.factories import lessons
@@ -52,6 +53,16 @@ def test_what_can_be_taught_and_judged(tmp_path: Path):
     sweeps(tmp_path / "one", "a", "a", "b")
     with pytest.raises(FormatError, match="1 of"):
         Lesson.read(tmp_path / "one").repeated()
+
+
+def test_sweeps_of_something_else_are_no_material(tmp_path: Path):
+    """They are kept beside the materials, and are not judged."""
+    sweeps(tmp_path, "a", NOT_THIS, "b", "a", "b", NOT_THIS)
+    lesson = Lesson.read(tmp_path).repeated()
+    assert lesson.sweeps.materials == ("a", "b")
+    assert len(lesson.names) == 4
+    assert lesson.strangers is not None
+    assert lesson.strangers.shape == (2, *lesson.sweeps.samples.shape[1:])
 
 
 def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):

@@ -15,6 +15,8 @@ from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
 from palpate.learn.process import TeachingProcess
+from palpate.sweeps.sweep_folder import NOT_THIS
+from palpate_train.answer.stranger_limits import FIGURES
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe import recipe
@@ -52,9 +54,15 @@ def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
 
 
 def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
-    """The recipe's without stages, and who taught it."""
+    """The recipe's without stages, and who taught it; three sweeps of something else are told."""
     sweeps = easy(12)
-    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
+    plain = replace(
+        sweeps,
+        samples=np.concatenate([sweeps.samples, np.roll(sweeps.samples[:3], 1, axis=2)]),
+        labels=np.append(sweeps.labels, [3, 3, 3]),
+        materials=(*sweeps.materials, NOT_THIS),
+        groups={"recording": np.arange(len(sweeps) + 3)},
+    )
     lessons.write(tmp_path / "sweeps", plain)
     code, (assessed,), loaded = ran(tmp_path / "sweeps")
     assert code == 0
@@ -76,6 +84,7 @@ def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     fit = recipe.fit(lesson.sweeps, Run(0), recipe.Settings())
     assert made.manifest.made["chosen"] == fit.about["chosen"]
     assert made.manifest.known
+    assert made.manifest.figures[FIGURES][NOT_THIS] == 3
     assert lines[-1]["peak_mb"] < 700
 
 

@@ -25,6 +25,7 @@ from palpate.answer.unknown import (
     Known,
     shaped_distances,
 )
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import fit_displacement, fit_early
 from palpate_train.answer.embedding import (
     NOTHING,
@@ -241,10 +242,9 @@ class CalibrationInputs:
 
     @property
     def beyond(self) -> Array:
-        """Mean features [J, F] of every second window of each kind of junk."""
-        if not self.junk:
-            return NOTHING
-        return np.stack([windows[::2].mean(axis=0) for windows in self.junk.values()])
+        """Mean features [J, F] of every second window of each kind of junk that was made."""
+        made = [of[::2].mean(axis=0) for kind, of in self.junk.items() if kind != NOT_THIS]
+        return np.stack(made) if made else NOTHING
 
     @cached_property
     def head_data(self) -> HeadData:
@@ -338,8 +338,11 @@ def left_out_in_turn(given: CalibrationInputs, finished: Embedding) -> dict[str,
 
 def junk_distances(given: CalibrationInputs, finished: Embedding) -> dict[str, Array]:
     """Distances of the junk that `beyond` does not show, by kind, to the nearest mean of the
-    finished model."""
-    return {kind: finished.novelty(features[1::2]) for kind, features in given.junk.items()}
+    finished model. Sweeps of NOT_THIS are few: all of them count."""
+    return {
+        kind: finished.novelty(features if kind == NOT_THIS else features[1::2])
+        for kind, features in given.junk.items()
+    }
 
 
 def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from palpate.answer.unknown import Known, shaped_distances
 from palpate.core.errors import FormatError
 from palpate.core.statistics import interval
+from palpate.sweeps.sweep_folder import NOT_THIS
 
 Array = NDArray[Any]
 FIGURES = "unknown materials"
@@ -30,9 +31,9 @@ COSTS = {"strict": 3.0, "balanced": 1.0, "loose": 1 / 9}
 """Cost of an unknown sweep with a label, where a known sweep without one costs 1, for each limit.
 On two simulated worlds and three materials, left out with a third of the positions, they answer 95,
 98 and 99.7 % of known sweeps, and give 1, 2 and 7 % of unknown ones a label."""
-MOST_UNKNOWN = 0.15
+MOST_UNKNOWN = 0.5
 """Largest share of held-out sweeps that a bundle may call unknown: export refuses it else."""
-LEAST_KEPT = {"strict": 0.5, "balanced": 0.5, "loose": 0.9}
+LEAST_KEPT = {"strict": 1 - MOST_UNKNOWN, "balanced": 1 - MOST_UNKNOWN, "loose": 0.9}
 MOST_KEPT = 0.995
 """Least share of known sweeps within each limit, and the largest, at any cost. A box that refuses
 more is of no use; a wider limit only lets strangers in."""
@@ -40,6 +41,8 @@ FEW_SWEEPS, LEAST_OF_FEW, LEAST_BY_JUNK = 50, 0.9, 0.85
 """Up to this number of sweeps of a material, the balanced limit keeps such a share, less with junk
 that shows where other things lie. Few sweeps say too little of strangers to give up known sweeps
 for them, and their cross-fits are farther away than new sweeps of the finished model."""
+FEW_STRANGERS = 3
+"""This number of sweeps of NOT_THIS counts half as much as many do: a single one may be a slip."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""
@@ -93,7 +96,7 @@ class StrangerLimits:
     `known` and `strangers`, numbers of sweeps; `guess`, whether too few materials were left out;
     for each limit the shares of known sweeps that are `answered` and of unknown ones that are
     `named`, with their intervals; `curve`, the two shares for limits from the lowest to the highest
-    that may be chosen."""
+    that may be chosen; of several conditions `by condition`, the two at these and at each limit."""
 
     strict: float
     balanced: float
@@ -137,7 +140,8 @@ def limits(
     """The limits of the least expected cost, over sweeps of all conditions, by their names.
 
     junk: squared distances [m] of windows without a slide over one material, by kind. A label for
-    one costs as much as one for an unknown material.
+    one costs as much as one for an unknown material, and so does one for a sweep of NOT_THIS, a
+    kind of its own.
 
     Each material has the same weight. Densities have smooth tails, so that a few sweeps promise
     nothing that they do not show. Without unknown sweeps the limits keep MOST_KEPT.
@@ -156,11 +160,13 @@ def limits(
     every = np.concatenate([known.logs, strangers.logs])
     grid = np.linspace(every.min() - reach, every.max() + reach, STEPS)
     kept, named = (_share_below(grid, one.by_material) for one in (known, strangers))
-    made = [_log(distances) for distances in junk.values()]
-    wrong, least_kept = named + _share_below(grid, made), dict(LEAST_KEPT)
+    made = [_log(distances) for kind, distances in junk.items() if kind != NOT_THIS]
+    own = [_log(junk[NOT_THIS])] if NOT_THIS in junk else []
+    weight = (counted := sum(map(len, own))) / (counted + FEW_STRANGERS)
+    wrong = named + _share_below(grid, made) + weight * _share_below(grid, own)
+    most, chosen, least_kept = int(np.argmax(kept >= MOST_KEPT)), {}, dict(LEAST_KEPT)
     if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
         least_kept["balanced"] = LEAST_BY_JUNK if junk else LEAST_OF_FEW
-    most, chosen = int(np.argmax(kept >= MOST_KEPT)), {}
     for name, cost in COSTS.items():
         cheapest = _cheapest(kept, wrong, stranger_cost * cost)
         least = int(np.argmax(kept >= least_kept[name]))
@@ -172,12 +178,36 @@ def limits(
         "strangers": len(strangers.logs),
         "guess": len(known.by_material) <= FEW,
         "curve": np.round(np.stack([kept, named], 1)[spread], 4).tolist(),
-    }
+    } | _by_condition(left_out, grid[spread], chosen)
     for name, limit in chosen.items():
         figures[name] = {"answered": known.within(limit)}
         if len(strangers.logs):
             figures[name]["named"] = strangers.within(limit)
+        for logs in own:
+            figures[NOT_THIS] = len(logs)
+            figures[name][NOT_THIS] = round(float(np.mean(logs <= np.log(limit))), 4)
     return StrangerLimits(**chosen, figures=figures)
+
+
+def _by_condition(
+    left_out: Mapping[str, LeftOut], curve: Array, chosen: Mapping[str, float]
+) -> dict[str, Any]:
+    """The figures of each of several conditions. curve: logarithms of limits."""
+    drawn = {"curve": curve, **{name: np.log([of]) for name, of in chosen.items()}}
+    judged = {
+        name: {what: _shares(one, at) for what, at in drawn.items()}
+        for name, one in left_out.items()
+        if np.isfinite(one.known).any() and np.isfinite(one.strangers).any()
+    }
+    return {"by condition": judged} if len(judged) > 1 else {}
+
+
+def _shares(one: LeftOut, logs: Array) -> list[list[float]]:
+    """The share of known sweeps within each limit, and that of unknown ones."""
+    pair = [of.by_material for of in _both([one])]
+    return [
+        [round(float(np.mean([np.mean(own <= at) for own in of])), 4) for of in pair] for at in logs
+    ]
 
 
 def _both(left_out: Iterable[LeftOut]) -> tuple[_Sweeps, _Sweeps]:
@@ -254,6 +284,9 @@ def lines(figures: Mapping[str, Any], limit: str = "balanced") -> list[str]:
     if named := shares.get("named"):
         guess = " (a guess: few materials were left out)" if found["guess"] else ""
         told.append(f"of materials that you did not teach {_percent(named)} get a label{guess}")
+    if own := found.get(NOT_THIS):
+        share = 100 * shares[NOT_THIS]
+        told.append(f"of {own} sweeps of {NOT_THIS!r} {share:.0f} % get a label")
     return told
 
 

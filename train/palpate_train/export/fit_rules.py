@@ -105,12 +105,13 @@ def _limits(
     fit: Fit,
 ) -> StrangerLimits:
     """The limits of known materials, for the widened shapes if there are any."""
-    cost = fit.about.get(stranger_limits.COST, 1.0)
     if found:
         distances = altered_sweeps.left_out_in_turn(found, given, whole)
-        return stranger_limits.limits(distances, cost)
-    distances = calibrate.left_out_in_turn(given, whole)
-    return stranger_limits.limits(distances, cost, calibrate.junk_distances(given, whole))
+        whole = replace(whole, shapes=found.shapes[1])
+    else:
+        distances = calibrate.left_out_in_turn(given, whole)
+    cost, junk = fit.about.get(stranger_limits.COST, 1.0), calibrate.junk_distances(given, whole)
+    return stranger_limits.limits(distances, cost, junk)
 
 
 def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:

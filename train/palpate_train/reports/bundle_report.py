@@ -6,6 +6,7 @@ It computes only shares of the counts in the figures of bundle_experiment.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,9 @@ MOST_IN_MATRIX = 12
 """Number of labels up to which the confusion matrix can be read on a phone. With more labels there
 is only the table."""
 QUARTERS = [0, 0.25, 0.5, 0.75, 1]
+ANSWERS = "answered", "named"
+LINES = ["-", "--", ":", "-."]
+"""Of the curves of conditions."""
 MOST_SHOWN = 6
 """Number of materials with an example sweep."""
 MATERIALS = [
@@ -105,7 +109,8 @@ def _pictures(figures: Json) -> dict[str, Markup]:
         pictures["confusion"] = html.picture(confusion(figures))
     if len(figures.get("curve", ())) > 1:
         pictures["curve"] = html.picture(curve(figures["curve"]))
-    if "named" in (found := figures["figures"].get(stranger_limits.FIGURES, {})).get("strict", {}):
+    found = figures["figures"].get(stranger_limits.FIGURES, {})
+    if "named" in found.get("strict", {}):
         pictures["strangers"] = html.picture(strangers(found))
     return pictures
 
@@ -279,14 +284,20 @@ def curve(points: Sequence[Json]) -> str:
 
 
 def strangers(found: Json) -> str:
-    """Share of unknown sweeps with a label over the share of known sweeps that are answered, with
-    the points of the three limits. found: figures of stranger_limits."""
+    """Share of unknown sweeps with a label over the share of known sweeps that are answered, a line
+    for each condition with the points of the three limits. found: figures of stranger_limits."""
     figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.2, bottom=0.5)
-    axes.plot(*np.transpose(found["curve"]), color=ACCENT, linewidth=2)
-    for limit in stranger_limits.COSTS:
-        x, y = found[limit]["answered"][0], found[limit]["named"][0]
-        axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
-        write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
+    shares = {limit: [[found[limit][of][0] for of in ANSWERS]] for limit in stranger_limits.COSTS}
+    total = {" or ".join(found["under"]): {"curve": found["curve"]} | shares}
+    each = found.get("by condition") or total
+    for style, (condition, of) in zip(cycle(LINES), each.items(), strict=False):
+        axes.plot(*np.transpose(of["curve"]), color=ACCENT, linewidth=2, linestyle=style)
+        first, share = of["curve"][0]
+        write(axes, first, share + 0.05, f"new {condition}", GREY, SMALL, ha="left")
+        for limit in stranger_limits.COSTS:
+            x, y = of[limit][0]
+            axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
+            write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
     axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
     axes.set_ylim(0, 1.05)
     set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)

@@ -21,6 +21,7 @@ from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.core.errors import ApplianceError
 from palpate.learn.assessment import CURVE, Assessment, LearningCurve
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import stranger_limits
 from palpate_train.answer.heads import HeadData, HeadPart
 from palpate_train.data.run import Run
@@ -41,7 +42,7 @@ def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    settings = recipe.Settings(most=len(lesson.sweeps))
+    settings = recipe.Settings(most=len(lesson.sweeps), calibrate=False)
     setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
@@ -54,7 +55,7 @@ def assess(lesson: Lesson) -> Assessment:
     found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
     found = replace(found, curve=curve(found, setup, fixed.data, parts, chosen.plan.parts))
     with suppress(ApplianceError):  # too few sweeps for a bundle
-        found = replace(found, others=others(recipe.finish(None, choice, setup)))
+        found = replace(found, others=others(lesson.finished(recipe.finish(None, choice, setup))))
     return found
 
 
@@ -100,6 +101,8 @@ def others(fit: Fit) -> dict[str, tuple[float, int]]:
         found = manifest.figures.get(stranger_limits.FIGURES, {})
         if named := found.get("balanced", {}).get("named"):
             told["sweeps of materials that were left out"] = named[0], found["strangers"]
+        if own := found.get(NOT_THIS):
+            told[f"sweeps of {NOT_THIS!r}"] = found["balanced"][NOT_THIS], own
     return told
 
 

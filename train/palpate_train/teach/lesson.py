@@ -11,31 +11,42 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.answer.slide_check import SlidesAmong
 from palpate.core.errors import FormatError
-from palpate.sweeps.sweep_folder import NoSlide, RecordedSweep, slides_alone, taught
+from palpate.sweeps.sweep_folder import (
+    NOT_THIS,
+    NoSlide,
+    RecordedSweep,
+    slides_alone,
+    taught,
+)
 from palpate_train.data import labels
 from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from_recorded
 from palpate_train.data.sets import Dataset
+from palpate_train.models.recipe.fitted import Fit, finished
 
 NOWHERE = "not named"
 """Position or session of a sweep without one, beside sweeps that have one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lesson:
     """Sweeps to learn from. names: of the file of each sweep [N], without suffix. left_out: number
     of sweeps that are not among them, by reason. no_slides: those of them that are not slides.
-    unchecked: what could not be seen of that, "" if all."""
+    unchecked: what could not be seen of that, "" if all. strangers: raw counts [n, T, R, C] or [n,
+    T, R, C, A] of sweeps over other things; None without any."""
 
     sweeps: Dataset
     names: tuple[str, ...]
     left_out: Mapping[str, int]
     no_slides: tuple[NoSlide, ...] = ()
     unchecked: str = ""
+    strangers: NDArray[Any] | None = None
 
     @classmethod
     def read(cls, folder: Path) -> Lesson:
@@ -43,7 +54,8 @@ class Lesson:
         sent."""
         check_folder(folder)
         left_out: Counter[str] = Counter()
-        kept = list(taught(folder, left_out))
+        every = list(taught(folder, left_out))
+        kept = [one for one in every if one.sweep.material != NOT_THIS]
         if not kept:
             why = f" ({counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
@@ -56,7 +68,17 @@ class Lesson:
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = from_recorded(_named(kept), folder, Dataset)
         names = tuple(one.path.stem for one in kept)
-        return cls(labels.check(sweeps), names, left_out, no_slides, unchecked)
+        others = [
+            one.sweep.frames.taxels
+            for one in every
+            if one.sweep.material == NOT_THIS and one.format == sweeps.format
+        ]
+        strangers = np.stack(others) if others else None
+        return cls(labels.check(sweeps), names, left_out, no_slides, unchecked, strangers)
+
+    def finished(self, fit: Fit) -> Fit:
+        """`fit` with limits that know the strangers."""
+        return finished(replace(fit, strangers=self.strangers))
 
     @property
     def _beside(self) -> str:

@@ -46,6 +46,24 @@ JUNK = {
     "materials that nobody taught": "{:,} slides over three materials that nobody taught",
 }
 """Texts of the groups of kinds in the campaign `junk`."""
+STRANGERS = {
+    "material near foam": "foam with every property up to a fifth larger or smaller",
+    "felt": "felt: soft as foam, with a finer and shallower pattern",
+    "random material": "each property from one of two known materials, up to a third larger or "
+    "smaller",
+    "random material, 50 Hz hum": "the same, with hum of 50 Hz of half of the deviation",
+    "random material, noise": "the same, with as much noise",
+    "random material, 35 % faster": "the same, 35 % faster than in training",
+    "random material, other skin": "the same on another skin: a fifth less sensitive, twice the "
+    "noise, more damping",
+    "softness alone": "softness alone half larger or a third smaller",
+    "roughness alone": "roughness alone, likewise",
+    "vibration alone": "vibration alone, likewise",
+    "halfway between two": "each property halfway between two known materials",
+    "mean of two slides": "mean of two slides over different materials",
+    "two halves": "half a slide over one material, half over another",
+}
+"""Texts of the kinds of that campaign that show where unknown materials get a label."""
 
 
 def stressed(results: Any) -> str:
@@ -70,6 +88,15 @@ def junk(results: Any) -> str:
     return _answers(rows)
 
 
+def strangers(results: Any) -> str:
+    """Where it takes an unknown material for a known one, from the same campaign."""
+    lines = ["| stranger | sweeps | label | with early answers |", "|---|---|---|---|"]
+    for kind, text in STRANGERS.items():
+        of = results["kinds"][kind]
+        lines.append(f"| {text} | {of['sweeps']} | {of['whole']} | {of['early']} |")
+    return "\n".join(["", *lines, ""])
+
+
 def _answers(rows: Iterable[tuple[str, int, int, int]]) -> str:
     lines = [
         f"| {text.format(total)} | {right:,} | {wrong:,} | {total - right - wrong:,} |"
@@ -81,6 +108,7 @@ def _answers(rows: Iterable[tuple[str, int, int, int]]) -> str:
 TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     (README, "stress", "stress", stressed),
     (README, "junk", "junk", junk),
+    ("docs/explanation/limits.md", "strangers", "junk", strangers),
     (README, "front", "development", development_report.caption),
     (SPECIFICATIONS, "bench", "bench", bench_table.table),
     (ALIGNMENT, "alignment", "alignment", contact_table.table),

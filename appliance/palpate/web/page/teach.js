@@ -5,6 +5,7 @@ import {signal} from "./plots.js";
 import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since, startAddress} from "./recording.js";
 
 const STEPS = {start: "waiting for the processor", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
+const NOT_THIS = "not this"; // the material of sweeps over other things, which move the limit of unknown ones
 let listed = "", ended = false, usedMs = 0;
 
 function teach() { return seen.recording?.teach ?? null; }
@@ -66,7 +67,8 @@ function drawLearnt() {
   const {recording} = seen, now = teach(), trying = recording?.trying, learnt = now?.learnt;
   if (trying) {
     put("accuracy", `${trying.model} is on trial`);
-    put("learnt", trying.taught);
+    const alike = trying.alike.map(shown).join(" and ");
+    put("learnt", alike ? `${trying.taught}; most easily taken for each other: ${alike}` : trying.taught);
     put("advice", "Slide over each material. Press one of them to teach more, or Finish to hand over to the robot.");
   } else if (learnt) {
     const {accuracy, low, high} = learnt;
@@ -92,7 +94,9 @@ function drawLearnt() {
   byId("use").hidden = Boolean(trying);
   byId("done").hidden = !trying;
   enable(byId("done"), may("teach"));
-  const many = Object.values(now?.materials ?? {}).filter((n) => n > 0).length;
+  const many = Object.entries(now?.materials ?? {}).filter(([name, n]) => n > 0 && name !== NOT_THIS).length;
+  byId("other").hidden = Boolean(now?.base.length);
+  enable(byId("other"), may("teach"));
   enable(byId("use"), may("teach") && now && many >= now.fewest && !now.using);
   byId("using").hidden = !now?.using;
   if (!now?.using) usedMs = 0;
@@ -171,6 +175,7 @@ const PRESSED = {
   undo: () => send("UNDO"),
   use: () => send("USE"),
   done: finish,
+  other: () => send("TEACH", NOT_THIS),
 };
 
 byId("teach").addEventListener("click", (event) => {

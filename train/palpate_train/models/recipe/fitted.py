@@ -22,12 +22,12 @@ from onnx import checker, shape_inference
 from palpate.core import storage
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.sweep_set import read
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadData, HeadPlan
-from palpate_train.answer.stranger_limits import NO_JUNK
 from palpate_train.data.augment import COPIES, Augmentation, copies
 from palpate_train.data.junk import JUNK, windows
 from palpate_train.data.sets import OWN_NUMBERS, Dataset
@@ -78,7 +78,8 @@ class Fit:
     the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
     again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
     do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
-    given: inputs of the calibration, kept for export if there are few sweeps; not in the file.
+    given: inputs of the calibration, kept for export if it knows other things than materials; not
+    in the file, nor are strangers: raw counts [n, T, ...] of materials that were not taught.
     """
 
     weights: dict[str, Array]
@@ -93,6 +94,7 @@ class Fit:
     uncalibrated: str = ""
     contacts: Contacts | None = None
     given: CalibrationInputs | None = None
+    strangers: Array | None = None
 
     @property
     def bands(self) -> int:
@@ -324,12 +326,13 @@ def calibration_inputs(fit: Fit, known: HeadData | None = None) -> CalibrationIn
 
 
 def _junk(fit: Fit) -> Mapping[str, Array]:
-    """Features of junk by kind; none where sweeps suffice without."""
+    """Features of junk by kind, none where sweeps suffice without; and of strangers."""
     every = np.append(fit.train.labels, fit.held.labels)
-    if np.bincount(every).min() > MOST_BY_JUNK:
-        return NO_JUNK
     trunk, tare, seed = fit.trunk(), fit.tare, fit.about["seed"]
-    return {
+    own = {} if fit.strangers is None else {NOT_THIS: run(trunk, fit.strangers)}
+    if np.bincount(every).min() > MOST_BY_JUNK:
+        return own
+    return own | {
         kind: run(trunk, windows(kind, fit.train, JUNK_EACH, tare, seed + JUNK_SEED))
         for kind in JUNK
     }
