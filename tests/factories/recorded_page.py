@@ -26,6 +26,8 @@ from tests.factories.page_client import EventReader, Page, ask, port
 KIND = "application/json"
 TAUGHT = {
     "teach": {
+        "base": [],
+        "fewest": 2,
         "materials": {"metal": 4},
         "learnt": None,
         "assessing": False,

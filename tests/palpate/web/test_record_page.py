@@ -447,8 +447,9 @@ def test_finish_ends_the_page_in_words(
         context = browser.new_context(viewport=size, color_scheme=scheme)
         seen = BrowsedPage(context, one.page.server.address)
         trying = {"model": "mine 1", "labels": ["metal"], "displays": {}, "taught": "here"}
-        one.more = {"trying": trying}
+        one.more = {"trying": trying | {"alike": ["metal", "wood"]}}
         one.recording.commands["DONE"] = lambda text: []
+        until(lambda: seen.text("#learnt").endswith("metal and wood"))
         seen.page.click("#done:not([aria-disabled=true])")
         until(lambda: seen.text("#what") == "Done")
     until(lambda: seen.text("#state") == "finished")

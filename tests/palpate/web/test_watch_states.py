@@ -147,6 +147,8 @@ def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
         assert seen.text("#sure") == "Perhaps wood, 48.1 %"
     shown.board.take(verdict(42, 396.0, "wood", "unsure", probability=0.9996))
     until(lambda: seen.text("#sure") == "Perhaps wood, 99.9 %")
+    assert "99.9" in seen.text("#rows")
+    assert "100.0" not in seen.text("#rows")
 
 
 def test_an_open_sweep_does_not_wear_the_answer_of_the_last(browser: Any, shown: Shown):

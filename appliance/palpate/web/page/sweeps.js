@@ -1,6 +1,6 @@
 /* The latest sweeps, as a list with filters. */
 
-import {byId, clock, common, count, counted, fill, made, mark, percent} from "./parts.js";
+import {byId, clock, common, count, counted, fill, made, mark, percentAtMost} from "./parts.js";
 import {WORDS} from "./verdict.js";
 
 const SHOWN = 200;
@@ -61,7 +61,7 @@ function row(one) {
   if (one.status !== "ok") mark(made("span", "chip", "", what), one.status);
   what.append(one.name || (WORDS[one.status] ?? ["", "", one.reason])[2]); // the chip says the rest
   if (!one.label) what.title = one.reason;
-  made("span", "number", one.label ? percent(one.probability) : "", made_row);
+  made("span", "number", one.label ? percentAtMost(one.probability) : "", made_row);
   made("span", "ms number", one.label ? `${(one.latency_ns / 1e6).toFixed(1)} ms` : "", made_row);
   if (one.moved) made("span", "more", one.moved, made_row);
   return made_row;

@@ -1,6 +1,6 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
-import {ago, byId, enable, fill, made, mark, put} from "./parts.js";
+import {ago, byId, enable, fill, made, mark, percentAtMost, put} from "./parts.js";
 import {signal} from "./plots.js";
 import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since, startAddress} from "./recording.js";
 
@@ -22,7 +22,7 @@ function drawTask() {
   const trying = recording.trying, now = teach(), name = recording.material;
   if (trying) {
     put("what", shown(last?.label) || (last ? last.reason || last.status : "Try it"));
-    put("count", last?.label ? `${(100 * last.probability).toFixed(0)} % sure` : `it knows ${trying.labels.map(shown).join(", ")}`);
+    put("count", last?.label ? `${percentAtMost(last.probability)} sure` : `it knows ${trying.labels.map(shown).join(", ")}`);
   } else if (now) {
     const n = now.materials[name] ?? 0;
     put("what", shown(name) || "Name a material");
