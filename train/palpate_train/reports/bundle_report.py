@@ -290,14 +290,17 @@ def strangers(found: Json) -> str:
     shares = {limit: [[found[limit][of][0] for of in ANSWERS]] for limit in stranger_limits.COSTS}
     total = {" or ".join(found["under"]): {"curve": found["curve"]} | shares}
     each = found.get("by condition") or total
-    for style, (condition, of) in zip(cycle(LINES), each.items(), strict=False):
-        axes.plot(*np.transpose(of["curve"]), color=ACCENT, linewidth=2, linestyle=style)
-        first, share = of["curve"][0]
-        write(axes, first, share + 0.05, f"new {condition}", GREY, SMALL, ha="left")
+    highest = max(each, key=lambda condition: each[condition]["balanced"][0][1])
+    for k, (style, (condition, of)) in enumerate(zip(cycle(LINES), each.items(), strict=False)):
+        line: dict[str, Any] = {"color": ACCENT, "linewidth": 2, "linestyle": style}
+        axes.plot(*np.transpose(of["curve"]), **line)
+        axes.plot([0.515, 0.55], [0.97 - 0.12 * k] * 2, **line)
+        write(axes, 0.56, 0.94 - 0.12 * k, f"new {condition}", GREY, SMALL, ha="left")
         for limit in stranger_limits.COSTS:
             x, y = of[limit][0]
             axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
-            write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
+            if condition == highest:
+                write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
     axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
     axes.set_ylim(0, 1.05)
     set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)
