@@ -19,6 +19,7 @@ from pathlib import Path
 from fleet import PALPATE, Failed, FleetBox, each, options
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
+from palpate.core.config import StoreConfig
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.deployment import signature
 from palpate.inference.classifier import Classifier
@@ -28,7 +29,7 @@ READY_S, STARTS = 60, 5
 itself, so after five there is no hope."""
 MOST_STATUS = 1 << 20
 """Most bytes that are read of a status file."""
-COUNTER = "/etc/palpate/counter"
+COUNTER = str(StoreConfig().least_counter)
 """Root's file with the counter of the last delivery."""
 LIMIT_S = 300
 """Time limit for each box."""

@@ -13,7 +13,6 @@ import argparse
 import shlex
 import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 
 import own_signer
@@ -125,8 +124,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.exit(f"palpate: {e}")
     signers = args.signers.read_text() if args.signers else ""
     asks = bool(args.host) and sys.stdin.isatty()
-    if args.key == own_key():
-        own_signer.line(partial(print, file=sys.stderr))  # makes the key
+    own_signer.make_own(args.key)
     write_manual(ROOT / "build" / "manual.md")
 
     def one(box: FleetBox) -> str:

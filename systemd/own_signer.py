@@ -6,7 +6,9 @@ from __future__ import annotations
 import getpass
 import re
 import subprocess
+import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from threading import Lock
 
@@ -14,6 +16,12 @@ from fleet import Failed
 from palpate.deployment.signature import own_key
 
 _LOCK = Lock()
+
+
+def make_own(key: Path) -> None:
+    """Make `key` if it is that of this person and not there. Raises Failed."""
+    if key == own_key():
+        line(partial(print, file=sys.stderr))
 
 
 def line(report: Callable[[str], None]) -> str:

@@ -123,8 +123,10 @@ def arrays_of(path: Path) -> tuple[str, ...]:
 
 def _read(path: Path, wanted: ReadPlan) -> Table:
     suffix = path.suffix.lower()
-    if path.is_file() and path.open("rb").read(len(POINTER)) == POINTER:
-        raise FormatError("is a pointer of Git LFS; fetch its content with git lfs pull")
+    if path.is_file():
+        with path.open("rb") as f:
+            if f.read(len(POINTER)) == POINTER:
+                raise FormatError("is a pointer of Git LFS; fetch its content with git lfs pull")
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
     if zarr_store.is_store(path):
         reader = zarr_store.read
