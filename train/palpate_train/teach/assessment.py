@@ -42,8 +42,9 @@ def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    settings = recipe.Settings(most=len(lesson.sweeps), calibrate=False)
+    settings = recipe.Settings(most=len(lesson.sweeps))
     setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
+    setup = replace(setup, strangers=lesson.strangers)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
     parts, scores, chosen = setup.parts, choice.scores, choice.chosen
@@ -55,7 +56,7 @@ def assess(lesson: Lesson) -> Assessment:
     found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
     found = replace(found, curve=curve(found, setup, fixed.data, parts, chosen.plan.parts))
     with suppress(ApplianceError):  # too few sweeps for a bundle
-        found = replace(found, others=others(lesson.finished(recipe.finish(None, choice, setup))))
+        found = replace(found, others=others(recipe.finish(None, choice, setup)))
     return found
 
 

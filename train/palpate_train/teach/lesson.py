@@ -28,7 +28,6 @@ from palpate.sweeps.sweep_folder import (
 from palpate_train.data import labels
 from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from_recorded
 from palpate_train.data.sets import Dataset
-from palpate_train.models.recipe.fitted import Fit, finished
 
 NOWHERE = "not named"
 """Position or session of a sweep without one, beside sweeps that have one."""
@@ -75,10 +74,6 @@ class Lesson:
         ]
         strangers = np.stack(others) if others else None
         return cls(labels.check(sweeps), names, left_out, no_slides, unchecked, strangers)
-
-    def finished(self, fit: Fit) -> Fit:
-        """`fit` with limits that know the strangers."""
-        return finished(replace(fit, strangers=self.strangers))
 
     @property
     def _beside(self) -> str:

@@ -43,11 +43,12 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings(calibrate=False))
+    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings())
+    setup = replace(setup, strangers=lesson.strangers)
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")
-    fit = lesson.finished(recipe.fit_size(setup, setup.settings.size))
+    fit = recipe.fit_size(setup, setup.settings.size)
     _check_useful(fit.about["validation"], counts, sweeps.materials)
     held = dict(zip(sweeps.materials, counts.tolist(), strict=True))
     fit = replace(fit, about=fit.about | {"taught": about | {"sweeps": held}})

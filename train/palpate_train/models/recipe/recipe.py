@@ -127,14 +127,16 @@ class Trunk:
         return graph.layout(self.sweeps.format, self.weights, self.architecture)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that the steps of a fit share, each part computed when it is first needed."""
+    """Everything that the steps of a fit share, each part computed when it is first needed.
+    strangers: as in Fit."""
 
     sweeps: Dataset
     run: Run
     settings: Settings
     augmentation: Augmentation
+    strangers: Array | None = None
 
     @classmethod
     def of(cls, sweeps: Dataset, run: Run, settings: Settings) -> Setup:
@@ -413,12 +415,9 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
     }
     made = Fit(
         {**trunk.weights, **heads},
-        trunk.scale,
-        trunk.architecture,
-        trunk.ranges,
-        *setup.sides,
-        about,
+        *(trunk.scale, trunk.architecture, trunk.ranges, *setup.sides, about),
         plan=plan.uncooled(),
+        strangers=setup.strangers,
     )
     if not settings.calibrate:
         return made
