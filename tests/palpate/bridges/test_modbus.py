@@ -24,7 +24,8 @@ from palpate.core.errors import FormatError
 from palpate.core.sentences import Sentence, read, sentence
 from palpate.core.status import Status
 from tests.factories import feed_lines, speaking_box
-from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
+from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually
+from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
 pytestmark = pytest.mark.usefixtures("hurried")
@@ -390,9 +391,9 @@ def test_each_status_has_its_code(status):
 
 
 def test_the_python_of_the_page_runs(box, raw, address):
-    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, others errors."""
+    """modbus_client.py: `unsure` is swept again, `ok` gives its code, others errors."""
     names: dict[str, Any] = {}
-    exec(page_blocks("modbus.md", "python")[0], names)
+    exec((ROOT / "docs" / "robots" / "modbus_client.py").read_text(), names)
     numbers = itertools.count(1)
     statuses = iter(["unsure", "ok", "unknown", "stuck-taxel"])
 

@@ -1,4 +1,4 @@
-"""The programs of docs/robots, run out of the pages: Python, and URScript read as Python."""
+"""The programs of docs/robots: Python, out of the pages, and URScript read as Python."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
 pytestmark = pytest.mark.usefixtures("hurried")
 
+ROBOTS = ROOT / "docs" / "robots"
 FAULTS = [s for s in Status if not s.classified and s not in (Status.UNKNOWN, Status.RECORDED)]
 
 
@@ -108,9 +109,9 @@ class SocketOfUr:
         self._socket.close()
 
 
-def urscript(block: str, **functions: Any) -> dict[str, Any]:
-    """A block of URScript as Python, without `end` and `local`; functions: the controller's."""
-    text = re.sub(r"(?m)^ *end\n", "", block).replace("local ", "")
+def urscript(program: str, **functions: Any) -> dict[str, Any]:
+    """A program in URScript as Python, without `end` and `local`; functions: the controller's."""
+    text = re.sub(r"(?m)^ *end\n", "", program).replace("local ", "")
     names: dict[str, Any] = {
         "str_find": lambda text, what, start=0: text.find(what, start),
         "str_len": len,
@@ -128,7 +129,7 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
     """The program with a socket."""
     ur = SocketOfUr(address)
     return urscript(
-        page_blocks("urscript.md", "urscript")[1],
+        (ROBOTS / "palpate_socket.script").read_text(),
         socket_open=ur.open,
         socket_read_string=ur.read,
         socket_send_line=ur.send_line,
@@ -137,7 +138,7 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
 
 
 def test_urscript_by_socket(box):
-    """urscript.md against a real bridge: a retry without NEW, each fault by its name."""
+    """palpate_socket.script against a real bridge: a retry without NEW, each fault by its name."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
         box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)
@@ -161,7 +162,7 @@ def test_urscript_by_socket(box):
     ],
 )
 def test_urscript_by_lines(ready, answers, want):
-    """urscript.md with lines: READY is waited for, code 0 is swept again, FAULT ends it."""
+    """palpate_lines.script: READY is waited for, code 0 is swept again, FAULT ends it."""
     inputs = {0: ready} | dict.fromkeys(range(1, 7), False)
     pulsed: list[int] = []
     left = iter(answers)
@@ -178,7 +179,7 @@ def test_urscript_by_lines(ready, answers, want):
             inputs.update({3 + bit: bool(code >> bit & 1) for bit in range(4)})
 
     program = urscript(
-        page_blocks("urscript.md", "urscript")[0],
+        (ROBOTS / "palpate_lines.script").read_text(),
         get_standard_digital_in=lambda n: inputs[n],
         set_standard_digital_out=set_output,
         sleep=lambda seconds: None,
@@ -207,7 +208,7 @@ def test_ros(box, program, settings):
     with ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"), ros.peer() as peer:
         eventually(lambda: bool(box.say(state()) or peer.on("state")))
         with subprocess.Popen(command, env=ros.environment(), **pipes) as cell:
-            action = (ROOT / "docs" / "robots" / "ros2_sweep.py").read_text()
+            action = (ROBOTS / "ros2_sweep.py").read_text()
             by_services = page_blocks("ros2.md", "python")[0]
             cell.stdin.write(action if program == "Sweeper" else by_services)
             cell.stdin.close()
