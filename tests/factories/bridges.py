@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from palpate.bridges import command
+from palpate.bridges import command, serve
 from palpate.bridges.options import PORTS, add_arguments
 from palpate.bridges.server import StopEvent
 from tests.factories.paths import ROOT
@@ -51,9 +51,16 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     def stop_event() -> StopEvent:
         stop, loop = StopEvent(), asyncio.get_running_loop()
         ends.append(lambda: loop.call_soon_threadsafe(stop.end, 0))
-        if not listen:
-            there.set_result(("", 0))
         return stop
+
+    class Flag(threading.Event):
+        exit_code = 0
+        __call__ = threading.Event.is_set
+
+        def __init__(self) -> None:
+            super().__init__()
+            ends.append(self.set)
+            there.set_result(("", 0))
 
     def work() -> None:
         try:
@@ -63,8 +70,9 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
             there.cancel()
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(command, "stop_event", stop_event)
-        patched.setattr(command, "_say", lambda args, server, box: there.set_result(server.address))
+        patched.setattr(serve, "stop_event", stop_event)
+        patched.setattr(serve, "_say", lambda args, server, box: there.set_result(server.address))
+        patched.setattr(command, "StopFlag", Flag)
         threading.Thread(target=work, daemon=True).start()
         try:
             address = there.result(LONG_S)

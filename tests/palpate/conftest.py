@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from palpate.bridges import command
+from palpate.bridges import source
 from palpate.client import feed, line
 from palpate.web import web
 
@@ -16,4 +16,4 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(line, "READ_S", 0.02)
     monkeypatch.setattr(feed, "RETRY_NS", 20_000_000)
     monkeypatch.setattr(web, "READ_S", 0.05)
-    monkeypatch.setattr(command, "EVERY_S", 0.05)
+    monkeypatch.setattr(source, "EVERY_S", 0.05)

@@ -48,6 +48,8 @@ LATE_NS = 1_000_000_000
 KEEPALIVE_S = 20
 """The broker sends the last will if it hears nothing for half as long again."""
 CONNECT_S = 5.0
+AGAIN_NS = 1_000_000_000
+"""Pause after a lost connection: two boxes of one name would take it from each other at once."""
 TICK_S = 0.5
 """Longest time between two looks at the state of the box and at the end of the program."""
 MOST_BYTES = 1024
@@ -167,6 +169,7 @@ class MqttBridge:
         if not self._stopped():
             why = f": {self._refused}" if self._refused else ""
             log.warning(f"mqtt: {self._broker} has ended the connection{why}; connecting again")
+            self._clock.sleep_until(self._clock.now_ns() + AGAIN_NS)
 
     def _connect(self) -> paho.Client:
         """A client that the broker has accepted. Raises AddressError."""

@@ -46,6 +46,8 @@ URI = "urn:palpate:box"
 """Namespace of the nodes. A node's identifier is its path, the same on every box."""
 WAITING = 1000
 """Results that wait to be written."""
+LOOK_S = 1.0
+"""Longest time between two looks at the box."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +92,7 @@ class OpcuaBridge:
         users = Login(user, password, clock, anonymous=offer.anonymous)
         self._server, self._users = Server(SmallServer(user_manager=users)), bool(user)
         self._event: EventGenerator | None = None
-        self._writing: asyncio.Task[None] | None = None
+        self.tasks: list[asyncio.Task[None]] = []
         self.source = source(self._take)
 
     async def close(self) -> None:
@@ -99,13 +101,6 @@ class OpcuaBridge:
             async with asyncio.timeout(CLOSE_S):  # peers that do not read their rest
                 await self._server.stop()
         await asyncio.to_thread(self.source.close)
-
-    async def work(self) -> None:
-        """Look at the box; to be called about once a second. Raises what ended the writing."""
-        await asyncio.to_thread(self.source.refresh)
-        self._come.set()
-        if self._writing and self._writing.done():
-            self._writing.result()
 
     async def open(self, host: str, port: int) -> None:
         """Make the nodes and listen. Raises AddressError or ConfigError as TcpServer does."""
@@ -131,8 +126,7 @@ class OpcuaBridge:
             hide_open_endpoint(server)
         assert server.bserver
         self.address = server.bserver.hostname, server.bserver.port
-        self._come.set()
-        self._writing = asyncio.create_task(self._write_all())
+        self.tasks.append(asyncio.create_task(self._write_all()))
 
     async def _add_variables(self, at: int) -> None:
         """Add the variables and the objects that hold them. at: index of the namespace."""
@@ -188,8 +182,11 @@ class OpcuaBridge:
         self._come.set()
 
     async def _write_all(self) -> None:
-        """Write the news as they come."""
-        while await self._come.wait():
+        """Write the news as they come, and look whether the box is silent."""
+        while True:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(LOOK_S):
+                    await self._come.wait()
             self._come.clear()
             view = self.source.view()
             alive = view.alive(self._clock.now_ns())

@@ -4,9 +4,11 @@ bridge."""
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from palpate.core.config import SerialConfig, StoreConfig
+from palpate.core.config import Config, SerialConfig, StoreConfig
 from palpate.core.errors import ConfigError
 
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
@@ -18,6 +20,8 @@ LINKS = {kind: f"/run/palpate-{kind}/line" for kind in ("tcp", "modbus", "mqtt",
 folders belong to palpate-bridge@.service."""
 FEED_KINDS = ("modbus", "mqtt", "opcua")
 """Bridges that can read the feed, as long as nobody commands."""
+SETTINGS = ("allow_writes", "short", "anonymous", "broker", "login", "ca", "name")
+"""Options of some bridges, and settings of the same names."""
 TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
@@ -122,3 +126,37 @@ def read_login(path: Path) -> tuple[str, str]:
             f"{path}: it needs two lines; put the user on the first, the password on the second"
         )
     return lines[0], lines[1]
+
+
+def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
+    """Fill in missing options from the settings of the box. Raises ConfigError if the settings give
+    the bridge no serial line."""
+    bridge = settings.bridge
+    if kind in PORTS and args.listen is None:
+        args.listen = f"{bridge.address}:{PORTS[kind]}"
+    for name in SETTINGS:
+        setattr(args, name, getattr(args, name, None) or getattr(bridge, name))
+    args.folder = getattr(args, "folder", None) or Path(bridge.opcua)
+    args.memory = Path(bridge.memory)
+    if args.port or args.link or args.feed:
+        return
+    if settings.serial.port == LINKS[kind]:
+        args.link = Path(LINKS[kind])
+    elif kind in FEED_KINDS and settings.store.feed and not args.allow_writes:
+        args.feed = str(settings.store.feed)
+    else:
+        why = " and the feed is read-only" if kind in FEED_KINDS else ""
+        raise ConfigError(
+            f'serial.port = "{settings.serial.port}" is not a serial line for this bridge{why}; '
+            "set serial.port = "
+            f'"{LINKS[kind]}", or name the box\'s serial line with --port'
+        )
+
+
+@contextmanager
+def needed(what: str, extra: str) -> Iterator[None]:
+    """Raises ConfigError if an import fails: `what` is not installed, and `extra` has it."""
+    try:
+        yield
+    except ImportError as e:
+        raise ConfigError(f"{what} is not installed ({e}); pip install 'palpate[{extra}]'") from e

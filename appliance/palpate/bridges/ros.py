@@ -190,10 +190,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         self._made = [
             (self.destroy_guard_condition, guard),
             (self.destroy_publisher, self._diagnostics),
-        ]
-        self._made += [
             (self.destroy_timer, self.create_timer(1.0, self._report)),
-            (self.destroy_timer, self.create_timer(1.0, self._refresh, callback_group=asking)),
         ]
         for name, command in SERVICES.items():
             service = self.create_service(
@@ -297,10 +294,6 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             self._diagnostics.publish(self._array(box_status(view, self._before, alive=alive)))
             self._before = view
             self._show(view)
-
-    def _refresh(self) -> None:
-        if self._source:
-            self._source.refresh()
 
 
 def run(arguments: Sequence[str]) -> None:

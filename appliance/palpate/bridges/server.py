@@ -16,7 +16,6 @@ from contextlib import suppress
 
 from palpate.core.errors import AddressError, ConfigError
 from palpate.core.interrupts import INTERRUPTED
-from palpate.core.log import log
 
 QUIET_S = 5.0
 """If the server is full, a connection that has sent nothing for this long is closed for a new
@@ -86,7 +85,9 @@ class TcpPeer:
 
 
 class TcpServer:
-    """Serves connections to `address`. peers: the open connections."""
+    """Serves connections to `address`. peers: the open connections. tasks: none that can fail."""
+
+    tasks: tuple[asyncio.Task[None], ...] = ()
 
     def __init__(self, serve: Serve, most: int) -> None:
         self.peers: set[TcpPeer] = set()
@@ -156,16 +157,6 @@ def stop_event() -> StopEvent:
     for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, INTERRUPTED)):
         loop.add_signal_handler(number, stop.end, code)
     return stop
-
-
-async def until(stop: asyncio.Event, every_s: float, work: Callable[[], Awaitable[None]]) -> None:
-    """Do the work every `every_s` until `stop` is set."""
-    while not stop.is_set():
-        await work()
-        with suppress(TimeoutError):
-            async with asyncio.timeout(every_s):
-                await stop.wait()
-    log.info("stopped")
 
 
 def not_listening(host: str, port: int, e: Exception) -> ConfigError:

@@ -5,6 +5,7 @@ The connection is the box's serial line, a pseudo-terminal that the box opens, o
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import os
 import select
@@ -12,17 +13,19 @@ import struct
 import termios
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from palpate.client.answers import Answer, BoxState
 from palpate.client.box import BAUD, Heard, Palpate
 from palpate.client.feed import Feed
-from palpate.client.line import READ_S
+from palpate.client.line import READ_S, open_port
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, TemporaryError, passes
+from palpate.core.log import log
 from palpate.core.status import Status
 from palpate.tools import pseudo_terminal
 
@@ -36,6 +39,8 @@ COMMANDS: Mapping[str, Callable[..., str | None]] = {
     "ABORT": Palpate.abort,
 }
 """Commands that a bridge may pass on to the box."""
+EVERY_S = 1.0
+"""Time between two looks whether the box has other labels."""
 OF_VERDICT = (
     *("sweep", "label", "probability", "margin", "fused", "lost", "bundle", "share", "detail"),
     *("measured_mm_s", "direction"),
@@ -89,27 +94,15 @@ class LineSource:
         self.name = name
         self._clock, self._also = clock or SystemClock(), heard
         self._view = BoxView()
+        self._named = "", tuple[str, ...]()  # a bundle and its labels
         self._box = Palpate(name, baud=baud, listener=self._heard, opener=opener, clock=self._clock)
+        self._ending = threading.Event()
+        threading.Thread(target=self._tend, daemon=True, name="palpate-labels").start()
 
     def view(self) -> BoxView:
-        return replace(
-            self._view,
-            missed=self._box.missed,
-            damaged=self._box.damaged,
-            trouble=self._box.trouble,
-        )
-
-    def refresh(self) -> None:
-        """Ask for the labels of a new bundle; may take seconds. To be called about once a
-        second."""
-        self._box.forget()  # nobody asks for results here
-        view = self._view
-        if view.state and view.state.bundle and view.state.bundle != view.bundle:
-            try:
-                labels = self._box.labels()
-            except ApplianceError:  # the next second is another chance
-                return
-            self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
+        (bundle, labels), box = self._named, self._box
+        view = replace(self._view, missed=box.missed, damaged=box.damaged, trouble=box.trouble)
+        return replace(view, bundle=bundle, labels=labels)
 
     def send(self, command: str, **slide: float) -> str:
         """Carry out one of COMMANDS; the box's reply. slide: speed_mm_s and force_n, for START
@@ -122,12 +115,22 @@ class LineSource:
         self._box.wait_ready(timeout_s)
 
     def close(self) -> None:
+        self._ending.set()
         self._box.close()
 
     def _heard(self, news: Heard) -> None:
         self._view = noted(self._view, news, self._clock.now_ns())
         if self._also:
             self._also(news)
+
+    def _tend(self) -> None:
+        """Ask for the labels of each new bundle."""
+        while not self._ending.wait(EVERY_S):
+            self._box.forget()  # nobody asks for results here
+            state = self._view.state
+            if state and state.bundle and state.bundle != self._named[0]:
+                with suppress(ApplianceError):  # the next time is another chance
+                    self._named = state.bundle, self._box.labels()
 
 
 class FeedSource:
@@ -156,9 +159,6 @@ class FeedSource:
 
     def view(self) -> BoxView:
         return replace(self._view, trouble=self._feed.trouble)
-
-    def refresh(self) -> None:
-        """Does nothing: `hello` brings the labels."""
 
     def send(self, command: str, **slide: float) -> str:
         """Raises CommandRefused: the feed is read-only."""
@@ -267,3 +267,28 @@ class LinkPort:
     def close(self) -> None:
         """Remove the name and the pseudo-terminal."""
         self._stack.close()
+
+
+def source_of(
+    args: argparse.Namespace, heard: Callable[[Heard], None] | None = None
+) -> FeedSource | LineSource:
+    """The box at the feed or the serial line of a bridge's options."""
+    if args.feed:
+        return FeedSource(args.feed, heard=heard)
+    return LineSource(*port_of(args), baud=args.baud, heard=heard)
+
+
+def port_of(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
+    """Name of the box's serial line, and a function that opens it. Raises ConfigError."""
+    if args.link:
+        link = LinkPort(args.link)  # now, so that a wrong path is reported at once
+        return str(args.link), lambda: link
+    return args.port, partial(open_port, args.port, args.baud)
+
+
+def warn_of(args: argparse.Namespace) -> None:
+    """Warn about a serial line or feed that is not there: it may come later."""
+    if args.port and "://" not in args.port and not Path(args.port).exists():
+        log.warning(f"--port {args.port} does not exist; trying again until it does, or correct it")
+    if args.feed and not Path(args.feed).exists():
+        log.warning(f"--feed {args.feed} does not exist; waiting until palpate runs there")

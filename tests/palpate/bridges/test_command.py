@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from palpate.bridges import command
-from palpate.bridges.options import LINKS, PORTS, add_arguments
+from palpate.bridges.options import LINKS, PORTS, add_arguments, settle
+from palpate.bridges.source import warn_of
 from palpate.core import config
 from palpate.core.errors import ConfigError
 from tests.factories.paths import NO_SITE, ROOT
@@ -27,7 +27,7 @@ def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Na
     parser = argparse.ArgumentParser("bridge")
     add_arguments(parser)
     args = parser.parse_args([kind, *options])
-    command.settle(kind, args, config.load(None, sets, site=NO_SITE))
+    settle(kind, args, config.load(None, sets, site=NO_SITE))
     return args
 
 
@@ -61,11 +61,11 @@ def test_ctrl_c_while_the_box_owes_an_answer(kind):
 
 def test_a_serial_line_that_is_not_there_gets_a_warning(caplog):
     """A port that does not exist is named; sockets and existing ports are not."""
-    command._warn(settled("modbus", "--port", "/dev/nonexist"))
+    warn_of(settled("modbus", "--port", "/dev/nonexist"))
     assert "/dev/nonexist" in caplog.text
     caplog.clear()
-    command._warn(settled("modbus", "--port", "/dev/null"))
-    command._warn(settled("tcp", "--port", "socket://127.0.0.1:9"))
+    warn_of(settled("modbus", "--port", "/dev/null"))
+    warn_of(settled("tcp", "--port", "socket://127.0.0.1:9"))
     assert not caplog.text
 
 

@@ -41,6 +41,7 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses of hundredths of a second between two tries."""
     monkeypatch.setattr(retry, "FIRST_S", 0.02)
     monkeypatch.setattr(retry, "MOST_S", 0.05)
+    monkeypatch.setattr(mqtt, "AGAIN_NS", 50_000_000)
 
 
 def options(server: Mosquitto, box: SpeakingBox, *more: str) -> tuple[str, ...]:
