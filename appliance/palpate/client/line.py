@@ -11,8 +11,6 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import serial
-
 from palpate.core import sentences
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import LinkLost
@@ -31,6 +29,8 @@ vanished."""
 
 def open_port(url: str, baud: int) -> Any:
     """The port at `url`. Raises OSError or ValueError."""
+    import serial  # readers of the feed do without it
+
     exclusive = None if "://" in url else True
     return serial.serial_for_url(
         url, baudrate=baud, timeout=READ_S, write_timeout=WRITE_S, exclusive=exclusive
