@@ -232,6 +232,11 @@ CAMPAIGNS = {
         "tests.cuts",
         nice=True,
     ),
+    "install-cuts": _module(
+        "cut the power of a host while it is installed or delivered to (as root; 40 minutes)",
+        "tests.campaigns.install_cuts",
+        prepare=containers,
+    ),
     "exceptions": _slow(
         "throw an exception at every call of the loop and count the answers (10 minutes)",
         "exceptions",

@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Sequence
 from contextlib import ExitStack, closing, suppress
 from itertools import count
@@ -86,13 +87,16 @@ class Host:
     """A host that has booted and answers on its ssh port.
 
     number: a unique number, 1 to 250, on this machine. work: an empty folder. key: its owner may
-    log in. Raises Missing if the host does not boot.
+    log in. volatile: changes are lost at the end. Raises Missing if the host does not boot.
     """
 
-    def __init__(self, root: Path, number: int, work: Path, key: Path) -> None:
+    def __init__(
+        self, root: Path, number: int, work: Path, key: Path, *, volatile: bool = True
+    ) -> None:
         self.name, self.address, self._key = f"box-{number}", f"{NET}.{number}.2", key
         (work / "parcel").mkdir(parents=True)
-        self.machine = nspawn.Machine(root, work / "parcel", work / "nspawn.log")
+        log = work / "nspawn.log"
+        self.machine = nspawn.Machine(root, work / "parcel", log, volatile=volatile)
         self.service = nspawn.Service(self.machine)
         try:
             self.pid = self.machine.first
@@ -124,6 +128,17 @@ class Host:
     def close(self) -> None:
         """Shut it down."""
         self.machine.close()
+
+
+def changed_wheel(wheel: Path, folder: Path, name: str, text: str) -> Path:
+    """Another release: the wheel with a new file, or with more text at the end of one."""
+    made = folder / wheel.name
+    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(made, "w") as new:
+        texts = {member: old.read(member) for member in old.namelist()}
+        texts[name] = texts.get(name, b"") + text.encode()
+        for member, content in texts.items():
+            new.writestr(member, content)
+    return made
 
 
 def key_of(home: Path) -> Path:

@@ -12,6 +12,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -129,12 +130,12 @@ class Machine:
     """A container that has booted; `run` runs a command in it as root.
 
     first: the number of its first process. root: the folder from `set_up`. parcel: a folder that
-    the container sees, read-only, as /parcel. log: file for the messages of nspawn. Raises Missing
-    if this machine cannot boot a container.
+    the container sees, read-only, as /parcel. log: file for the messages of nspawn. volatile:
+    changes are lost at the end. Raises Missing if this machine cannot boot a container.
     """
 
-    def __init__(self, root: Path, parcel: Path, log: Path) -> None:
-        self._log, self._group = log, _group()
+    def __init__(self, root: Path, parcel: Path, log: Path, *, volatile: bool = True) -> None:
+        self.parcel, self._log, self._group = parcel, log, _group()
         with (
             tempfile.TemporaryDirectory() as place,
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear,
@@ -146,7 +147,8 @@ class Machine:
                 *("setpriv", "--pdeathsig", "TERM"),  # a killed test run leaves no container
                 *("systemd-nspawn", "--quiet", f"--directory={root}", "--boot", "--keep-unit"),
                 *(f"--machine=palpate-{os.getpid()}", "--register=no", "--console=pipe"),
-                *("--private-network", "--volatile=overlay", "--notify-ready=yes"),
+                *("--private-network", "--notify-ready=yes"),
+                *(("--volatile=overlay",) if volatile else ()),
                 "--system-call-filter=bpf",  # IPAddressDeny= of the units
                 f"--bind-ro={parcel}:/parcel",
             )
@@ -183,15 +185,32 @@ class Machine:
         self, *command: str, say: str = "", limit_s: float = 300
     ) -> subprocess.CompletedProcess[str]:
         """Run a command in it to the end, with `say` as its input."""
-        enter = ("nsenter", "-t", self.first, *NAMESPACES, "env", "-i", PATH)
         return subprocess.run(
-            [*enter, *command],
+            [*self._enter(), *command],
             input=say,
             capture_output=True,
             text=True,
             timeout=limit_s,
             check=False,
         )
+
+    def begin(self, *command: str) -> subprocess.Popen[str]:
+        """Start a command in it as `run` does, with its output in a pipe."""
+        return subprocess.Popen(
+            [*self._enter(), *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def _enter(self) -> tuple[str, ...]:
+        return ("nsenter", "-t", self.first, *NAMESPACES, "env", "-i", PATH)
+
+    def cut(self) -> None:
+        """Kill all its processes at once, as if its power failed."""
+        os.kill(int(self.first), signal.SIGKILL)
+        self._process.wait(WAIT_S)
 
     def as_user(self, pid: int | str, user: str, *command: str) -> subprocess.CompletedProcess[str]:
         """Run a command as a user, with its groups, in the file system that a process sees."""

@@ -14,7 +14,6 @@ import socket
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
@@ -61,17 +60,6 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
     # reported, not changed silently
     assert "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
     return done.stdout
-
-
-def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
-    """Another release: the wheel with a new file, or with more text at the end of one."""
-    made = folder / wheel.name
-    with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(made, "w") as new:
-        texts = {member: old.read(member) for member in old.namelist()}
-        texts[name] = texts.get(name, b"") + text.encode()
-        for member, content in texts.items():
-            new.writestr(member, content)
-    return made
 
 
 class DeployedBox:
@@ -230,7 +218,9 @@ def upgraded(
     folder, box = tmp_path_factory.mktemp("releases"), DeployedBox(site)
     outputs = [(box.release(), installed)]
     for i in range(2):
-        done = box.does("install", changed(wheel, folder, "palpate/more.py", f"# {i}\n"))
+        done = box.does(
+            "install", hosts.changed_wheel(wheel, folder, "palpate/more.py", f"# {i}\n")
+        )
         outputs.append((box.release(), done.stdout + done.stderr))
     return outputs
 
@@ -251,7 +241,9 @@ def test_a_release_that_does_not_start_gives_way_to_the_old_one(
 ):
     """Self-test passed, no start: the link is swapped back, the old one classifies."""
     before = box.release()
-    broken = changed(wheel, tmp_path, "palpate/service/systemd.py", "\nNotifier.turn = None\n")
+    broken = hosts.changed_wheel(
+        wheel, tmp_path, "palpate/service/systemd.py", "\nNotifier.turn = None\n"
+    )
     done = box.does("install", broken, code=1)
     assert "TypeError: 'NoneType'" in done.stdout
     assert done.stdout.endswith(f"; so {before} runs again\n")
@@ -263,7 +255,7 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
 ):
     """The process that classifies is not touched."""
     before, fails = box.runs(), "\nraise OSError('not on this box')\n"
-    broken = changed(wheel, tmp_path, "palpate/inference/classifier.py", fails)
+    broken = hosts.changed_wheel(wheel, tmp_path, "palpate/inference/classifier.py", fails)
     assert "self-test: OSError: not on" in box.does("install", broken, code=1).stdout
     assert box.runs() == before
 
@@ -275,7 +267,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     box: DeployedBox, wheel: Path, tmp_path: Path, said: str, after_s: float
 ):
     """Cut during the copy or the build: the old release starts, a second call ends it."""
-    new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
+    new = hosts.changed_wheel(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
     before = box.release()
     key = ("--key", box.site.work / "keys" / "key")
     box.site.cut("install", *box.at, *key, "--wheel", new, words=said, after_s=after_s)
@@ -292,7 +284,7 @@ def test_a_release_that_was_sent_back_is_refused(
     """A new release is on trial, and dies: the box goes back by itself, the desktop says so, and
     the same release is refused then."""
     before, dies = box.release(), "\nimport os\nNotifier.turn = lambda *_: os.abort()\n"
-    broken = changed(wheel, tmp_path, "palpate/service/systemd.py", dies)
+    broken = hosts.changed_wheel(wheel, tmp_path, "palpate/service/systemd.py", dies)
     assert f"failed its trial, so {before} runs again" in box.does("install", broken, code=1).stdout
     box.service.until("ActiveState", "active")
     assert box.release() == before

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from palpate.deployment.release_trial import ReleaseTrial
     from palpate.deployment.shadow import Shadow
     from palpate.deployment.store import Choice
+    from palpate.sweeps.black_box import BlackBox
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,12 +81,13 @@ def _classify(
             "disk": lambda: disk.text,
             "unsigned": lambda: unsigned,
         }
-        reports = _reports(settings, current, devices.source, facts, stack, disk)
-        if release and settings.store.runtime_folder:
-            reports += _compared(release, settings, choice, current, stack, disk)
-        observers = [
-            o for o in (disk, Notifier(SystemClock()), trial, release, shadow, *reports) if o
-        ]
+        kept, compared = _kept(settings, current, release, stack, disk), None
+        if kept and release and settings.store.runtime_folder:
+            of = choice.folder if choice else Path(settings.classifier.bundle)
+            compared = release_trial.comparison(release, kept, of)
+        reports = _reports(settings, current, devices.source, facts)
+        watching = Notifier(SystemClock()), trial, release, shadow, kept, compared, *reports
+        observers = [disk, *filter(None, watching)]
         recorded = capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack
         box = assembly.box(*parts, capture=recorded, observers=observers)
@@ -94,23 +96,25 @@ def _classify(
     return stopped.exit_code
 
 
-def _compared(
-    release: ReleaseTrial,
+def _kept(
     settings: Config,
-    choice: Choice | None,
     current: Bundle,
+    release: ReleaseTrial | None,
     stack: ExitStack,
     disk: DiskThread,
-) -> list[Observer]:
-    """Keeps the latest sweeps in memory, and compares them with the answers of the proven
-    release."""
+) -> BlackBox | None:
+    """The black box, which also holds the sweeps that a release on trial is judged by: in memory if
+    the settings have none."""
+    most = settings.store.black_box
+    compared = release_trial.KEPT if release and settings.store.runtime_folder else 0
+    if not (most or compared):
+        return None
     from palpate.sweeps.black_box import BlackBox
 
-    folder = Path(settings.store.runtime) / "trial"
-    of = choice.folder if choice else Path(settings.classifier.bundle)
-    kept = BlackBox(folder, current.format, release_trial.KEPT, disk)
+    folder = settings.kept("black-box") if most else Path(settings.store.runtime) / "trial"
+    kept = BlackBox(folder, current.format, max(most, compared), disk)
     stack.callback(kept.close)
-    return [kept, release_trial.comparison(release, folder, of)]
+    return kept
 
 
 def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
@@ -121,25 +125,11 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
     return teaches and not fits(profile.format, packaged.format)
 
 
-def _reports(
-    settings: Config,
-    current: Bundle,
-    source: str,
-    facts: Facts,
-    stack: ExitStack,
-    disk: DiskThread,
-) -> list[Observer]:
+def _reports(settings: Config, current: Bundle, source: str, facts: Facts) -> list[Observer]:
     """The observers that the settings ask for, with `facts`. source: origin of the frames."""
     # without a serial port, a terminal shows the sentences
     shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
     observers: list[Observer] = [VerdictLog()] if shown else []
-    if settings.store.black_box:
-        from palpate.sweeps.black_box import BlackBox
-
-        folder = settings.kept("black-box")
-        kept = BlackBox(folder, current.format, settings.store.black_box, disk)
-        stack.callback(kept.close)
-        observers.append(kept)
     m, model = current.manifest, _named(current.manifest)
     facts = {"model": lambda: model, **facts}
     from palpate.alignment.live import Expected

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from palpate.core.types import Verdict
     from palpate.deployment.releases import ReleaseReport
     from palpate.deployment.state import TrialProgress
+    from palpate.sweeps.black_box import BlackBox
 
 GOAL = Goal(50, 24 * 3600.0, both=True)
 """A release is proven after 50 sweeps with a label and 24 hours in which the skin streamed."""
@@ -143,10 +144,13 @@ class ReleaseComparison(Observer):
             self._ended(self._process)
 
 
-def comparison(trial: ReleaseTrial, kept: Path, bundle: Path) -> ReleaseComparison:
-    """Compares the sweeps in the folder `kept`, which were answered by the bundle in a folder."""
-    words = [trial.proven, "-I", "-m", "palpate.runtime.replay", str(kept), str(bundle)]
-    return ReleaseComparison(words, trial.goes_back)
+def comparison(trial: ReleaseTrial, kept: BlackBox, bundle: Path) -> ReleaseComparison | None:
+    """Compares the kept sweeps of this run, which were answered by the bundle in a folder; None if
+    none are kept. Earlier ones may be of an earlier release."""
+    if kept.run is None:
+        return None
+    words = ["-I", "-m", "palpate.runtime.replay", str(kept.path), str(bundle), str(kept.run)]
+    return ReleaseComparison([trial.proven, *words], trial.goes_back)
 
 
 def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:

@@ -22,17 +22,23 @@ from palpate.sweeps.sweep_folder import SweepFolder
 class BlackBox(Observer):
     """Keeps the last `most` sweeps in `folder`, also over restarts. The oldest sweep is removed
     after the new sweep was written, on a full disk before. disk: does that; a sweep that it refuses
-    is not kept."""
+    is not kept. path: the folder."""
 
     def __init__(
         self, folder: Path, format: SweepFormat, most: int, disk: DiskWork | None = None
     ) -> None:
-        self._path, self._format, self._most = folder, format, most
+        self.path, self._format, self._most = folder, format, most
         self._disk = disk or AtOnce()
         self._folder: SweepFolder | None = None
         end, advice = "black box: sweeps are kept again", f"see to {folder}"
         self._log = TroubleLog("black box: no sweep is kept", advice, end=end)
         self._with_folder(lambda folder: None)  # now, since it waits for the disk several times
+
+    @property
+    def run(self) -> int | None:
+        """The number in the folder after which the sweeps of this run come; None without a folder
+        that can be used."""
+        return self._folder.run if self._folder else None
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and remove the oldest sweep beyond `most`."""
@@ -49,7 +55,7 @@ class BlackBox(Observer):
         def attempt() -> None:
             # a folder that cannot be used at the start may be usable later, and must not stop the
             # box
-            self._folder = self._folder or SweepFolder(self._path, self._format)
+            self._folder = self._folder or SweepFolder(self.path, self._format)
             act(self._folder)
 
         self._log.attempt(attempt)

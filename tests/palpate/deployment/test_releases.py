@@ -11,12 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.bundle.bundle import DEFAULT
+from palpate.cli.main import main
 from palpate.core.errors import ConfigError
 from palpate.core.health import Health
 from palpate.core.types import Status, Verdict
 from palpate.deployment import release_trial, releases
 from palpate.deployment.release_trial import ReleaseTrial
 from palpate.deployment.releases import Releases
+from palpate.sim import skin
+from palpate.sweeps.black_box import BlackBox
 from tests.factories import feeds
 
 SECOND = 1_000_000_000
@@ -281,7 +285,11 @@ def comparing(box: TrialBox, trial: ReleaseTrial, program: str) -> release_trial
     proven.parent.mkdir(exist_ok=True)
     proven.write_text(f"#!/bin/sh\n{program}\n")
     proven.chmod(0o755)
-    return release_trial.comparison(trial, box.report, box.report)
+    kept = BlackBox(box.opt.parent / "kept", skin.FORMAT, 9)
+    compared = release_trial.comparison(trial, kept, box.report)
+    kept.close()
+    assert compared
+    return compared
 
 
 def answer(box: TrialBox, trial: ReleaseTrial, program: str, n: int) -> int:
@@ -323,6 +331,33 @@ def test_a_release_that_answers_alike_stays(box: TrialBox, program: str):
     trial.stopping()
     assert box.start() is not None
     assert box.runs == NEW
+
+
+RUN = ["run", "--sim", "skin", "--virtual", "--sweeps", "3", "--set"]
+
+
+@pytest.mark.parametrize(("black_box", "folder"), [(0, "run/trial"), (9, "var/black-box")])
+def test_sweeps_on_trial_are_written_once(
+    box: TrialBox, monkeypatch: pytest.MonkeyPatch, black_box: int, folder: str
+):
+    """Into the black box, else into memory; the proven release gets the sweeps of this run."""
+    folders = f"store.folder={box.opt.parent / 'var'}", f"store.runtime={box.opt.parent / 'run'}"
+    words = [*RUN, f"store.black_box={black_box}", *(w for f in folders for w in ("--set", f))]
+    if black_box:
+        assert main(words) == 0
+    trial, asked = box.start(), []
+    monkeypatch.setattr(release_trial, "observed", lambda: trial)
+    given = release_trial.ReleaseComparison
+    monkeypatch.setattr(
+        release_trial,
+        "ReleaseComparison",
+        lambda command, differs: asked.append(command) or given(command, differs),
+    )
+    assert main(words) == 0
+    kept = box.opt.parent / folder
+    runs = 2 if black_box else 1
+    assert len([*box.opt.parent.rglob("*.npy")]) == len([*kept.glob("*.npy")]) == 3 * runs
+    assert asked[0][-3:] == [str(kept), str(DEFAULT), str(3 * (runs - 1))]
 
 
 def test_a_comparison_that_hangs_is_ended(box: TrialBox):

@@ -7,7 +7,8 @@ import json
 import re
 import subprocess
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from palpate.learn.program import (
     TeachingProgram,
     TryingPhase,
 )
-from palpate.learn.session import TeachingSession
+from palpate.learn.session import MOST_NAMED, TeachingSession
 from palpate.runtime import assembly
 from palpate.sim import skin
 from palpate_train.data.sets import Dataset
@@ -332,18 +333,40 @@ def test_a_trained_material_is_refused_before_a_sweep(box, capsys):
         assert phase.obey(command("TEACH", "cork")) == ["cork"]
 
 
-@pytest.mark.parametrize("allowed", [False, True])
-def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
-    """With teach.serial = false the page alone sets labels, discards, teaches and forgets."""
+@contextmanager
+def by_line(box: TaughtDelivery, *, allowed: bool) -> Iterator[RecordingPhase]:
+    """A box that records with commands of its serial line. allowed: teach.serial."""
     trigger, teach = box.settings.trigger, box.settings.teach
     settings = replace(box.settings, trigger=replace(trigger, mode="serial"))
     settings = replace(settings, teach=replace(teach, serial=allowed))
     devices = Devices(SystemClock())
     program = TeachingProgram(settings, devices, skin.FORMAT, TaughtLesson(waits="no page"))
     program.pages, program.address = (), ""
-    orders = (("MATERIAL", "felt"), ("POSITION", "2"), ("SESSION", "b"), ("NEXT", ""))
     with ExitStack() as stack:
-        phase = RecordingPhase(program, stack)
+        yield RecordingPhase(program, stack)
+
+
+@pytest.mark.parametrize("name", ["TEACH", "MATERIAL"])
+@pytest.mark.parametrize("allowed", [False, True])
+def test_a_flood_of_names_by_the_line_is_bounded(box, allowed, name):
+    """7,160 names: without teach.serial none is taken, with it a page has few to show."""
+    taken = 0
+    with by_line(box, allowed=allowed) as phase:
+        for number in range(7160):
+            with suppress(ApplianceError):
+                phase.box.obey(command(name, f"name {number}"))
+                taken += 1
+        shown = phase.about()
+    assert (taken > 0) is allowed
+    assert [*shown["teach"]["materials"].values()].count(0) <= MOST_NAMED
+    assert len(json.dumps(shown)) < 10_000
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
+    """With teach.serial = false the page alone sets labels, discards, teaches and forgets."""
+    orders = (("MATERIAL", "felt"), ("POSITION", "2"), ("SESSION", "b"), ("NEXT", ""))
+    with by_line(box, allowed=allowed) as phase:
         for name, text in (*orders, ("TEACH", "felt"), ("FORGET", "felt"), ("DISCARD", "")):
             before = phase.about()
             try:
