@@ -95,12 +95,17 @@ def write(path: Path) -> None:
 
 
 def _plain(page: str) -> str:
-    """A page without pictures, with links as text; headings below its title one level down."""
-    text = re.sub(r"(?s)<!-- as text:\n\n(.*?)\n*-->", r"\1", page)
-    text = re.sub(r"(?s)<!--.*?-->\n?", "", text)
-    text = re.sub(r"(?m)^!\[[^\]]*\]\([^)]*\)\n\n?", "", text)
+    """A page with pictures and links as text; headings below its title one level down."""
+    text = re.sub(r"(?s)<!--.*?-->\n?", "", page)
+    text = re.sub(r"(?m)^!\[[^\]]*\]\(([^)]*)\)\n\n?", _drawing, text)
     text = re.sub(r"\[([^\]]+)\]\(([^)#]*)[^)]*\)", _reference, text)
     return re.sub(r"(?m)^(#{2,}) ", r"#\1 ", text)
+
+
+def _drawing(picture: re.Match[str]) -> str:
+    """The drawing in characters that lies next to a picture of docs/manual, "" if there is none."""
+    drawn = (ROOT / "docs" / "manual" / Path(picture[1]).name).with_suffix(".txt")
+    return f"{drawn.read_text('ascii')}\n" if drawn.exists() else ""
 
 
 def _reference(link: re.Match[str]) -> str:

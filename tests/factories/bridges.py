@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import re
 import socket
 import struct
 import threading
@@ -18,15 +17,8 @@ import pytest
 from palpate.bridges import command, serve
 from palpate.bridges.options import PORTS, add_arguments
 from palpate.bridges.server import StopEvent
-from tests.factories.paths import ROOT
 
 LONG_S = 30.0
-
-
-def page_blocks(page: str, language: str) -> list[str]:
-    """The code blocks in this language on a page in docs/robots."""
-    text = (ROOT / "docs" / "robots" / page).read_text()
-    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
 def eventually(there: Callable[[], bool]) -> None:

@@ -1,4 +1,4 @@
-"""The programs of docs/robots: Python, out of the pages, and URScript read as Python."""
+"""The programs of docs/robots: Python, and URScript read as Python."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from palpate.core.errors import NoAnswer
 from palpate.core.sentences import Sentence
 from palpate.core.status import Status
 from tests.factories import ros
-from tests.factories.bridges import LONG_S, bridge, eventually, page_blocks
+from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
@@ -49,7 +49,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
 def test_python(box):
     """`unsure` is swept again without NEW, final ones are set aside, each fault is an error."""
     names: dict[str, Any] = {}
-    exec(page_blocks("python.md", "python")[0], names)
+    exec((ROBOTS / "classify.py").read_text(), names)
     with Palpate(str(box.path), timeout_s=LONG_S) as client:
         box.script = answering(
             "unsure", "ok", "undecided", "unknown", "unsure", "unsure", "unsure", *FAULTS
@@ -194,7 +194,7 @@ def test_urscript_by_lines(ready, answers, want):
     ids=["services", "action"],
 )
 def test_ros(box, program, settings):
-    """ros2.md: a node in a process of its own, by services and by the action."""
+    """ros2_services.py, ros2_sweep.py: a node in a process of its own, by both."""
     ros.required()
     ros.messages_required()
     box.script = answering("unsure", "ok", "unknown", "stuck-taxel", "unsure", "unsure", "unsure")
@@ -209,7 +209,7 @@ def test_ros(box, program, settings):
         eventually(lambda: bool(box.say(state()) or peer.on("state")))
         with subprocess.Popen(command, env=ros.environment(), **pipes) as cell:
             action = (ROBOTS / "ros2_sweep.py").read_text()
-            by_services = page_blocks("ros2.md", "python")[0]
+            by_services = (ROBOTS / "ros2_services.py").read_text()
             cell.stdin.write(action if program == "Sweeper" else by_services)
             cell.stdin.close()
             told = [json.loads(cell.stdout.readline()) for _ in range(4)]

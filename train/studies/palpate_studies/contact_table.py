@@ -22,18 +22,14 @@ SHOWN = {
         (0.0, "not at all"),
         (1.0, "1 mm towards row 4"),
         (2.0, "2 mm"),
-        (2.5, "2.5 mm"),
         (3.0, "3 mm"),
         (4.0, "4 mm, one row"),
         (5.0, "5 mm"),
-        (-2.5, "2.5 mm towards row 1"),
-        (-4.0, "4 mm"),
+        (-4.0, "4 mm towards row 1"),
     ),
     "columns": (
-        (-2.5, "2.5 mm towards column 1"),
-        (-4.0, "4 mm"),
-        (2.5, "2.5 mm towards column 4"),
-        (4.0, "4 mm"),
+        (-4.0, "4 mm towards column 1"),
+        (4.0, "4 mm towards column 4"),
     ),
 }
 """Displacements in mm that have a line."""

@@ -1,4 +1,4 @@
-"""The tables of the recipe's views, from the results of the study `recipe`."""
+"""The table of the recipe's views, from the results of the study `recipe`."""
 
 from __future__ import annotations
 
@@ -74,23 +74,3 @@ def _on(view: str, sets: Sequence[Json]) -> str:
     if len(without) < len(chosen):
         return f"all but {', '.join(without)}"
     return ", ".join(chosen) or "no set"
-
-
-def loads(results: Json) -> str:
-    """A row for each world and condition, with the figures with and without the view."""
-    rows = [
-        "| world | condition | sweeps | with loads: label, box, wrong | "
-        "without: label, box, wrong |",
-        "|---|---|---|---|---|",
-    ]
-    for row in results["loads"]:
-        told = [
-            ", ".join(f"{row[which][name]:.1f} %" for name in ("label", "right", "wrong"))
-            if row[which]
-            else "not chosen"
-            for which in ("with", "without")
-        ]
-        rows.append(
-            f"| {row['world']} | {row['condition']} | {row['sweeps']} | {told[0]} | {told[1]} |"
-        )
-    return "\n".join(rows)

@@ -113,7 +113,6 @@ TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     (SPECIFICATIONS, "bench", "bench", bench_table.table),
     (ALIGNMENT, "alignment", "alignment", contact_table.table),
     (RECIPE, "recipe", "recipe", recipe_page.table),
-    (RECIPE, "loads", "recipe", recipe_page.loads),
     ("docs/how-to/train.md", "rules", "rules", rules_table.table),
     (FABRICS, "matrix", "fabrics", matrix_table.headline),
     *(("docs/explanation/figures.md", *one) for one in quantities.TABLES),
