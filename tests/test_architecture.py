@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from palpate_train.models import methods
-from tests.factories import emulated_machines
 from tests.factories.paths import ROOT
+from tests.rig import emulated_machines
 
 SOURCES = sorted(
     [*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")]

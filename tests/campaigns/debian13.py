@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.factories.emulated_machines import HOME, ROOT, Missing, run, whole
+from tests.rig.emulated_machines import HOME, ROOT, Missing, run, whole
 
 SUITE = "trixie"
 PACKAGES = ("ca-certificates", "git", "libusb-1.0-0", "make", "openssh-client", "python3-venv")

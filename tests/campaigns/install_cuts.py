@@ -24,9 +24,11 @@ from itertools import count
 from pathlib import Path
 
 from tests.cuts.scene import stage
-from tests.factories import deliveries, emulated_machines, hosts, nspawn
-from tests.factories.emulated_machines import run
+from tests.factories import deliveries
 from tests.factories.paths import ROOT
+from tests.rig import emulated_machines
+from tests.rig.emulated_machines import run
+from tests.systemd import hosts, nspawn
 
 LATEST_S = 30.0
 """Longest time from the boot to the first answer."""

@@ -2,7 +2,7 @@
 arm64.
 
 qemu emulates them, instruction by instruction. PALPATE_MACHINES=1 gets the tools for that (see
-tests/factories/emulated_machines.py) and fails without them; otherwise tests without their tools
+tests/rig/emulated_machines.py) and fails without them; otherwise tests without their tools
 are skipped.
 """
 
@@ -21,9 +21,9 @@ from palpate.bundle import bundle
 from palpate_train.data import sets
 from palpate_train.export import quantized_bundle
 from palpate_train.onnx_tools.graph_builder import TENSOR
-from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import with_stages
+from tests.rig import emulated_machines
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # emulated processors
 

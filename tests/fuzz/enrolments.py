@@ -21,8 +21,8 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
 from palpate.learn import enrolment
 from tests.factories import toy_bundle
-from tests.factories.mutated_enrolments import changed
 from tests.fuzz.files import one_line
+from tests.fuzz.mutated_enrolments import changed
 
 LABELS = ("cork", "felt", "silk")
 MOST_SWEEPS = 1_000_000

@@ -6,8 +6,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.factories.emulated_machines import Missing
 from tests.rig.cell import Cell
+from tests.rig.emulated_machines import Missing
 from tests.rig.image import ground, image, lacking
 from tests.rig.machine import Guest
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from palpate.sim import script
-from tests.factories.emulated_machines import Missing
 from tests.rig import notes
 from tests.rig.cell import Cell
+from tests.rig.emulated_machines import Missing
 from tests.rig.image import Image
 from tests.rig.image import image as make_image
 from tests.rig.machine import Guest

@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.factories import emulated_machines
-from tests.factories.emulated_machines import ROOT, Missing, run, whole
 from tests.factories.install_scripts import run_here
+from tests.rig import emulated_machines
+from tests.rig.emulated_machines import ROOT, Missing, run, whole
 
 HERE = Path(__file__).parent
 GUEST = HERE / "guest"

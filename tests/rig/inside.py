@@ -6,7 +6,7 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 from tests.backends import Skin, skins
-from tests.factories.emulated_machines import ROOT
+from tests.rig.emulated_machines import ROOT
 from tests.rig.machine import Guest
 
 RUNNER = ("pytest", "pluggy", "iniconfig", "pygments")

@@ -20,8 +20,8 @@ from typing import Any
 from palpate.core.sentences import checksum
 from palpate.core.sweep_file import load
 from palpate.core.types import Status, Sweep
-from tests.factories.emulated_machines import ROOT
 from tests.rig.cell import Cell
+from tests.rig.emulated_machines import ROOT
 from tests.rig.machine import Guest
 
 KEPT = "/var/lib/palpate/kept"

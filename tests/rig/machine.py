@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-from tests.factories.emulated_machines import run
 from tests.rig import guest_clock
+from tests.rig.emulated_machines import run
 from tests.rig.far_end import FarEnd
 from tests.rig.image import LINES, MACHINE, Image
 from tests.rig.lines import GuestLines

@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.factories.emulated_machines import ROOT
+from tests.rig.emulated_machines import ROOT
 
 FILE = ROOT / "build" / "rig" / "faults.jsonl"
 

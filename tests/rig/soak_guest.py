@@ -21,9 +21,9 @@ import numpy as np
 
 from palpate.io import packets
 from palpate.sim import rig, script, skin
-from tests.factories.emulated_machines import LOCK
 from tests.rig import image
 from tests.rig.cell import IDLE
+from tests.rig.emulated_machines import LOCK
 from tests.rig.lines import GuestLines
 from tests.rig.machine import Guest
 from tests.rig.shell import GuestFailed

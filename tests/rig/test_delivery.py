@@ -21,14 +21,16 @@ import pytest
 from palpate.bundle import bundle
 from palpate.deployment.state import MOST_STARTS
 from palpate.sim import script
-from tests.factories import deliveries, emulated_machines, hosts
+from tests.factories import deliveries
 from tests.factories.install_scripts import require_pyinfra
+from tests.rig import emulated_machines
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST, Image, ground, layer
 from tests.rig.kept import PALPATE, found
 from tests.rig.machine import Guest
 from tests.rig.notes import HOW, Note
 from tests.rig.sound import known, not_wrong
+from tests.systemd import hosts
 
 pytestmark = pytest.mark.skipif(
     HOW != "full",

@@ -16,11 +16,11 @@ import pytest
 
 from palpate.io import skin_profile
 from palpate.sim import rig, script, skin
-from tests.factories.emulated_machines import ROOT
 from tests.factories.skins.devices import Reel
 from tests.factories.skins.player import Player
 from tests.factories.skins.wires import wire
 from tests.rig.cell import SEEN_S, Cell
+from tests.rig.emulated_machines import ROOT
 from tests.rig.far_end import ADAPTER
 from tests.rig.image import Image
 from tests.rig.kept import checked, runs_with

@@ -6,11 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.factories.nspawn import NOBODY, SITE, STREAMS, Machine, Service
+from tests.systemd.nspawn import NOBODY, SITE, STREAMS, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 TCP, MODBUS = "palpate-bridge@tcp", "palpate-bridge@modbus"
 LINE = "/run/palpate-tcp/line"

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.factories import emulated_machines, hosts
 from tests.factories.install_scripts import SCRIPTS, require_pyinfra
-from tests.factories.nspawn import PALPATE, SITE, WAIT_S
 from tests.factories.paths import ROOT
+from tests.rig import emulated_machines
+from tests.systemd import hosts
+from tests.systemd.nspawn import PALPATE, SITE, WAIT_S
 
 require_pyinfra()
 APT = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-q")

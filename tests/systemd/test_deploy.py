@@ -22,10 +22,12 @@ from threading import Thread
 
 import pytest
 
-from tests.factories import deliveries, emulated_machines, hosts
+from tests.factories import deliveries
 from tests.factories.install_scripts import SCRIPTS, require_pyinfra, run_here
-from tests.factories.nspawn import CABLE, CABLED, PALPATE, SIM, WAIT_S
 from tests.factories.paths import ROOT
+from tests.rig import emulated_machines
+from tests.systemd import hosts
+from tests.systemd.nspawn import CABLE, CABLED, PALPATE, SIM, WAIT_S
 
 require_pyinfra()
 

@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from tests.factories.install_scripts import run_here
-from tests.factories.nspawn import PLACES, SITE, STREAMS, WAIT_S, Machine, Service
+from tests.systemd.nspawn import PLACES, SITE, STREAMS, WAIT_S, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 PYTHON = "/opt/palpate/bin/python"
 PAGE, MODBUS, TCP = "palpate-watch", "palpate-bridge@modbus", "palpate-bridge@tcp"

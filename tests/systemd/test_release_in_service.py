@@ -6,11 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.factories.nspawn import NOBODY, PALPATE, SIM, STREAMS, Machine, Service
+from tests.systemd.nspawn import NOBODY, PALPATE, SIM, STREAMS, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 NEW, OLD = "palpate-2-new", "palpate-1-old"
 FAST = "RestartSec=100ms"

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from tests.factories import nspawn
-from tests.factories.emulated_machines import ROOT
-from tests.factories.nspawn import (
+from tests.rig.emulated_machines import ROOT
+from tests.systemd import nspawn
+from tests.systemd.nspawn import (
     CABLED,
     NOBODY,
     PALPATE,
@@ -21,8 +21,6 @@ from tests.factories.nspawn import (
 )
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 START_S = 8
 """Time to start, and by how much each sign of life extends it: more than a busy machine needs to

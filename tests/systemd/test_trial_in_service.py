@@ -14,11 +14,9 @@ from typing import Any
 import pytest
 
 from tests.factories import deliveries
-from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, WAIT_S, Machine, Service
+from tests.systemd.nspawn import CABLED, PALPATE, SITE, STREAMS, WAIT_S, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 CURSED = """
 import os, signal, sys, time

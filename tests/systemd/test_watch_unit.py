@@ -7,11 +7,9 @@ from typing import Any
 import pytest
 
 from tests.factories.install_scripts import run_here
-from tests.factories.nspawn import NOBODY, SITE, STREAMS, Machine, Service
+from tests.systemd.nspawn import NOBODY, SITE, STREAMS, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
-
-pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 UNIT = "palpate-watch"
 ASK = """

@@ -1,6 +1,6 @@
 """Runs the classifier of the box on emulated processors and collects its outputs.
 
-`python -m tests.factories.emulated_machines` makes an arm64 userland once, in
+`python -m tests.rig.emulated_machines` makes an arm64 userland once, in
 ~/.cache/palpate/machines: unpacked packages of Debian and the wheels of
 appliance/requirements.lock. qemu's user mode runs it, and it emulates older x86 processors. It
 needs no root and changes nothing outside that folder. With two arguments, FROM TO, the module is
@@ -76,7 +76,7 @@ def qemu(kind: str) -> str:
             return found
     raise Missing(
         f"no qemu-{kind} here; apt-get install qemu-user-static, "
-        "or run python -m tests.factories.emulated_machines"
+        "or run python -m tests.rig.emulated_machines"
     )
 
 
@@ -94,7 +94,7 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     usr = folder() / "root" / "usr"
     if not usr.exists():
         raise Missing(
-            "no arm64 userland here; run python -m tests.factories.emulated_machines "
+            "no arm64 userland here; run python -m tests.rig.emulated_machines "
             "(30 s, 300 MB in ~/.cache/palpate)"
         )
     env |= {"PYTHONPATH": f"{folder() / 'site'}:{SOURCES}", "PYTHONHOME": str(usr)}

@@ -1,6 +1,6 @@
 """A real systemd: a container with Debian, systemd as PID 1 and the box installed as on a board.
 
-`python -m tests.factories.nspawn` makes the Debian once, in ~/.cache/palpate/nspawn: packages of
+`python -m tests.systemd.nspawn` makes the Debian once, in ~/.cache/palpate/nspawn: packages of
 Debian, and a virtual environment with the wheels of appliance/requirements.lock. `Machine` boots it
 in half a second. Changes stay in memory and are lost at the end. The container has no devices, and
 its limits of memory and processor are not enforced. It needs root.
@@ -23,7 +23,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from tests.factories.emulated_machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel, whole
+from tests.rig.emulated_machines import HOME, LOCK, PIP, ROOT, Missing, run, wheel, whole
 
 CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"

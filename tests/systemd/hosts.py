@@ -1,7 +1,7 @@
 """Real hosts: containers with Debian, each with a network namespace, an sshd and a bare user.
 
 `make install` and `make deploy` are tested on them, as root on this machine. `python -m
-tests.factories.hosts` makes their Debian.
+tests.systemd.hosts` makes their Debian.
 
 Their Debian is made once, in ~/.cache/palpate/hosts, in two kinds: `bare` has the packages of an
 install in apt's cache, as from a mirror; `ready` has them installed. Changes on a host are lost
@@ -23,8 +23,8 @@ from itertools import count
 from pathlib import Path
 from typing import Self
 
-from tests.factories import nspawn
-from tests.factories.emulated_machines import HOME, ROOT, Missing, run, whole
+from tests.rig.emulated_machines import HOME, ROOT, Missing, run, whole
+from tests.systemd import nspawn
 
 CACHE = HOME.parent / "hosts"
 PACKAGES = ("systemd", "systemd-sysv", "openssh-server", "sudo", "dbus")
