@@ -39,7 +39,7 @@ class WindowLimits:
     contact: least mean over time of a loaded taxel, in counts above the tare. With None every taxel
     counts as loaded, since loads do not differ from the unloaded skin. full_scale: the sensor's
     highest count. saturated: largest accepted share of full-scale counts. dead_taxels: largest
-    accepted number of dead taxels.
+    accepted number of taxels without a signal, of the stuck ones and of the dead ones.
     """
 
     contact: Annotated[float, Within(0, MOST)] | None
@@ -54,7 +54,7 @@ class Finding:
 
     degraded: the broken taxels that were bridged, None for none. mean: counts of the window that
     was checked, in the shape of a frame, if the check passed. full: share of the counts at
-    full scale, likewise.
+    full scale, likewise; silent: number of its stuck or dead taxels, the larger one.
     """
 
     status: Status
@@ -62,6 +62,7 @@ class Finding:
     degraded: str | None = None
     mean: NDArray[np.float64] | None = field(default=None, compare=False)
     full: float = field(default=0.0, compare=False)
+    silent: int = field(default=0, compare=False)
 
     @property
     def detail(self) -> str:
@@ -114,7 +115,7 @@ def inspect(
         return Finding(Status.OK, mean=window.mean.reshape(tare.shape))
     full, still = np.zeros(shape) if full is None else full, window.still.reshape(shape)
     stuck = still & loaded & (full < 1)
-    if stuck.any():
+    if (count := int(stuck.any(axis=2).sum())) > limits.dead_taxels:
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
     share = float(full.mean())
     if share > limits.saturated:
@@ -124,7 +125,8 @@ def inspect(
         dead = silent & enclosed(loaded[..., 0])[..., None]
         if dead.sum() > limits.dead_taxels:
             return Finding(Status.DEAD_TAXEL, _taxels(dead & still))
-    return Finding(Status.OK, mean=window.mean.reshape(tare.shape), full=share)
+        count = max(count, int(dead.sum()))
+    return Finding(Status.OK, mean=window.mean.reshape(tare.shape), full=share, silent=count)
 
 
 def ceiling(measured: Window, full_scale: float) -> float:

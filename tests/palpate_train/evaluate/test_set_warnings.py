@@ -46,15 +46,21 @@ def test_what_no_fold_can_judge_is_counted():
 
 @pytest.mark.parametrize(("count", "told"), [(None, ""), (100, "stuck-taxel"), (255, "saturated")])
 def test_sweeps_that_the_box_would_refuse_are_counted(count: int | None, told: str):
-    """Before a fit: a loaded taxel that never changes, and counts at the end of the range."""
+    """Before a fit: a loaded taxel that never changes, and counts at the end of the range. A bundle
+    refuses a few, and accepts many."""
     rng = np.random.default_rng(2)
     samples = rng.integers(60, 140, (12, 64, 2, 2)).astype(np.uint8)
     if count is not None:
         samples[:3, :, 0, 0] = count
     sweeps = Dataset(samples, np.arange(12) % 2, ("a", "b"), 100.0, {}, "skin")
-    lines = [line for line in set_warnings.of_set(sweeps) if "box would refuse" in line]
+    lines = [line for line in set_warnings.of_set(sweeps) if "faults of the skin" in line]
     assert len(lines) == bool(told)
     assert all("3 of 12 sweeps" in line and told in line for line in lines)
+    assert all("accepts such" in line for line in lines)
+    numbers = np.append(np.arange(2, 12), np.resize(np.arange(3, 12), 20))
+    few = [line for line in set_warnings.of_set(sweeps.take(numbers)) if told and told in line]
+    assert all("1 of 30 sweeps" in line and "would refuse" in line for line in few)
+    assert len(few) == bool(told)
     assert set_warnings.of_set(sweeps, learned=False) == []
 
 

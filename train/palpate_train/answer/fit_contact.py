@@ -159,8 +159,14 @@ def _limit_of_raw_counts(means: Array) -> ContactLimit:
             "record, and send TARE with the finger lifted",
         )
     weakest = float(means.max(axis=(1, 2)).min())
-    # also below the weakest contact if a tared skin was pulled, which gives negative counts
-    return ContactLimit(weakest - (1 - SHARE) * abs(weakest), tare)
+    if weakest < 0:  # of a tared skin that was pulled, or of a sensor without a level
+        return ContactLimit(
+            None,
+            tare,
+            f"the weakest sweep reads {weakest:.6g} counts, below 0; record with palpate record, "
+            "and send TARE with the finger lifted",
+        )
+    return ContactLimit(SHARE * weakest, tare)
 
 
 def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:

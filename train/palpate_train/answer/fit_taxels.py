@@ -21,7 +21,6 @@ from palpate.answer.load_modes import LoadModes
 from palpate.answer.taxels import Bridging, Comparison, places
 from palpate.answer.vibration import PARTS
 from palpate.answer.window import Window
-from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
@@ -72,7 +71,7 @@ class Tolerance:
 
     def written(self, manifest: Manifest) -> Manifest:
         """`manifest` with all of it."""
-        saturated = max(MANY_FULL, self.saturated or 0.0)
+        saturated = max(manifest.thresholds.saturated, self.saturated or 0.0)
         limits = replace(manifest.thresholds, saturated=saturated)
         figures = manifest.figures | {FIGURES: self.figures}
         return replace(manifest, bridging=self.bridging, thresholds=limits, figures=figures)
@@ -309,6 +308,8 @@ def _lines(rows: int, cols: int, name: str) -> Iterable[Array]:
 
 def text(manifest: Manifest) -> str:
     """The broken taxels that a bundle tolerates, with the answers at the worst places, in words."""
+    if silent := manifest.thresholds.dead_taxels:
+        return f"broken taxels: up to {silent} without a signal are accepted, as in the recordings"
     if manifest.bridging is None:
         unknown = "" if FIGURES in manifest.figures else "not measured, so "
         return f"broken taxels: {unknown}the box refuses them"

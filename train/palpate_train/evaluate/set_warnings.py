@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.window_check import WindowLimits, inspect
+from palpate.answer.window_check import WindowLimits
 from palpate.core.status import Status
+from palpate_train.answer import fit_window_check
 from palpate_train.answer.fit_contact import find_limit
 from palpate_train.data import repeats
 from palpate_train.data.readers import counted
@@ -37,18 +38,23 @@ def of_set(sweeps: Dataset, learned: bool = True) -> list[str]:
 
 
 def _refused(sweeps: Dataset) -> Iterator[str]:
-    """A warning about sweeps that the box would refuse by its check of a window, which no figure
-    of a fit contains. It bridges some broken taxels only where export proves that this pays."""
-    limit, kind = find_limit(sweeps), sweeps.samples.dtype
-    top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
-    limits = WindowLimits(limit.contact, float(top))
-    status = [inspect(window, limit.tare, limits).status for window in sweeps.samples]
-    refused = Counter(str(one) for one in status if one is not Status.OK)
+    """A warning about sweeps that the box refuses by the usual limits of its check of a window,
+    which no figure of a fit contains. It bridges some broken taxels only where export proves that
+    this pays."""
+    limit = find_limit(sweeps)
+    limits = WindowLimits(limit.contact, fit_window_check.highest_count(sweeps))
+    found = fit_window_check.findings(sweeps, limits, limit.tare)
+    refused = Counter(str(one.status) for one in found if one.status is not Status.OK)
     if refused:
+        few = refused.total() <= fit_window_check.MOST_REFUSED * len(sweeps)
+        does = (
+            "the box would refuse them unless it may bridge their taxels; drop them"
+            if few
+            else "a bundle accepts such sweeps, and faults like these with them; mend the skin"
+        )
         yield (
-            f"warning: the box would refuse {refused.total()} of {len(sweeps)} sweeps unless it "
-            f"may bridge their taxels: {counted(refused)}; drop them or mend the skin, for export "
-            "refuses a fit to many of them"
+            f"warning: {refused.total()} of {len(sweeps)} sweeps look like faults of the skin: "
+            f"{counted(refused)}; {does}"
         )
 
 

@@ -22,6 +22,7 @@ from palpate_train.answer import (
     fit_early,
     fit_slide,
     fit_taxels,
+    fit_window_check,
     rules,
     stranger_limits,
 )
@@ -149,11 +150,13 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
     pack.pack."""
     train, contacts = content.train, content.contacts or Contacts.of(content.train)
     place = contacts.positions(pitch_mm)
+    limits = replace(manifest.thresholds, contact=contacts.limit.contact)
+    limits = fit_window_check.fitted(limits, (train, content.held_out), contacts.limit.tare)
     speeds, unmeasured = fit_slide.trained_speeds(train, place.pitch_mm if place else None)
     unknown = {"contact": contacts.limit.why, "speeds": unmeasured}
     manifest = replace(
         manifest,
-        thresholds=replace(manifest.thresholds, contact=contacts.limit.contact),
+        thresholds=limits,
         contact=place,
         unloaded=contacts.limit.known_tare(),
         speeds=speeds,
@@ -168,7 +171,8 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
 
 def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -> Bundle:
     """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
-    that do not pay. Heads judge that have not seen the held-out sweeps."""
+    that do not pay. Heads judge that have not seen the held-out sweeps. On a skin whose sound
+    sweeps have taxels without a signal, broken ones cannot be told from these."""
     left_out, figures = list(asked.left_out), dict[str, Any]()
     seed = int(content.about.get("seed", 0))
     if proven:
@@ -178,10 +182,11 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
             entries = {name: bundle.file_entry(data) for name, data in files.items()}
             text = replace(packed.manifest, files=entries, early=None).json()
             judging = bundle.from_files(files | {bundle.MANIFEST: text}, packed.manifest.name)
-        found = fit_taxels.measure(judging, content.train, content.held_out, seed)
-        packed, judging = (
-            replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
-        )
+        if not packed.manifest.thresholds.dead_taxels:
+            found = fit_taxels.measure(judging, content.train, content.held_out, seed)
+            packed, judging = (
+                replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
+            )
         left_out, figures = trial.decided(judging, content.held_out, seed, asked)
         for name in set(asked.kept) - set(rules.present(packed)):
             figures[name] = {"kept": False, "because": "absent"}

@@ -25,6 +25,7 @@ from palpate.bundle import bundle
 from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
+from palpate_train.answer.fit_window_check import MOST_REFUSED, highest_count
 from palpate_train.answer.rules import ALL, Asked, present
 from palpate_train.answer.stranger_limits import MOST_UNKNOWN
 from palpate_train.data import extras, repeats
@@ -38,9 +39,6 @@ from palpate_train.models.methods import model_inputs
 from palpate_train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
-MOST_REFUSED = 0.05
-"""Largest share of held-out sweeps that the box may refuse, because of stuck taxels, for instance;
-more means that thresholds do not fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 LICENCE = "licence"
@@ -161,11 +159,8 @@ def pack_to_measure(content: Content, target: Path) -> bundle.Manifest:
 def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
     """The thresholds for a window; without `full_scale` the highest count of the type is the full
     scale."""
-    kind = sweeps.samples.dtype
-    top = np.finfo(kind).max if kind.kind == "f" else np.iinfo(kind).max
-    return bundle.Thresholds(
-        contact=None, full_scale=float(top if full_scale is None else full_scale)
-    )
+    top = highest_count(sweeps) if full_scale is None else float(full_scale)
+    return bundle.Thresholds(contact=None, full_scale=top)
 
 
 def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
