@@ -13,24 +13,28 @@ return a temperature. They differ in how they treat the little that held-out swe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate.answer.objects import LEAST_PROBABILITY
 
 Array = NDArray[Any]
 TEMPERATURES = np.geomspace(1, 100, 200)
 """Candidates of `platt_temperature` and `sufficient_temperature`. Posteriors of LDA (temperature 1)
 are never underconfident; at 100 they are almost uniform."""
-LOG_TEMPERATURES = (-6, 4)
-"""Range that `weighted_platt_temperature` searches."""
+STEP, PRECISION = 0.5, 1e-5
+COARSE = np.arange(-6, 4 + STEP, STEP)
+"""Logarithms of temperatures that `weighted_platt_temperature` compares first, because very sure
+logits have several minima, and the precision of the result."""
 SLACK = 0.5
 """Standard errors by which the log loss of `sufficient_temperature` may exceed the smallest loss.
 With 0, four of fourteen calibrated heads got worse by more than 0.1 percentage points (simulated,
 seeds 301 to 316). With 1, heads judged by four positions stay overconfident."""
-TINY = 1e-12
+LOG_TINY, MOST_LOSS = np.log(1e-12), -np.log(LEAST_PROBABILITY)
+"""Least logarithm of a probability, and largest loss: one absurd sweep does not decide."""
 
 
 def platt_temperature(logits: Array, labels: Array) -> float:
@@ -39,30 +43,32 @@ def platt_temperature(logits: Array, labels: Array) -> float:
     Each label counts as right with probability (n + 1) / (n + 2) (Platt 1999). Without this
     correction a few held-out sweeps, all right, would allow any confidence.
     """
-    wrong = 1 / (len(labels) + 2)
+    wrong, log_p = 1 / (len(labels) + 2), _cooled(logits)
     costs = []
     for t in TEMPERATURES:
-        z = logits / t
-        z = z - z.max(axis=1, keepdims=True)
-        log_p = z - np.log(np.exp(z).sum(axis=1, keepdims=True))
-        right = log_p[np.arange(len(labels)), labels]
-        costs.append(-np.mean((1 - wrong) * right + wrong * log_p.mean(axis=1)))
+        p = log_p(t)
+        right = p[labels, np.arange(len(labels))]
+        costs.append(-np.mean((1 - wrong) * right + wrong * p.mean(axis=0)))
     return float(TEMPERATURES[np.argmin(costs)])
 
 
 def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> float:
     """The temperature with the lowest cross entropy, with Platt's correction as above and the
     `weights` [n] of the sweeps, which sum to 1. It may be below 1."""
-    from scipy.optimize import minimize_scalar
-
-    wrong = 1 / (len(labels) + 2)
+    wrong, log_p = 1 / (len(labels) + 2), _cooled(logits)
 
     def cost(log_temperature: float) -> float:
-        p = np.log(np.maximum(softmax(logits / np.exp(log_temperature)), TINY))
-        right = p[np.arange(len(p)), labels]
-        return float(-weights @ ((1 - wrong) * right + wrong * p.mean(axis=1)))
+        p = np.maximum(log_p(np.exp(log_temperature)), LOG_TINY)
+        right = p[labels, np.arange(len(labels))]
+        return float(-weights @ ((1 - wrong) * right + wrong * p.mean(axis=0)))
 
-    return float(np.exp(minimize_scalar(cost, bounds=LOG_TEMPERATURES).x))
+    best = COARSE[int(np.argmin([cost(t) for t in COARSE]))]
+    low, high = best - STEP, best + STEP
+    while high - low > PRECISION:
+        middle = (low + high) / 2
+        falls = cost(middle + PRECISION) <= cost(middle)
+        low, high = (middle, high) if falls else (low, middle)
+    return float(np.exp(middle))
 
 
 def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float:
@@ -78,7 +84,8 @@ def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float
         groups = np.arange(len(labels))
     member = np.unique(groups, return_inverse=True)[1]
     size = np.bincount(member)
-    losses = np.stack([_log_losses(logits / t, labels) for t in TEMPERATURES])
+    log_p, numbers = _cooled(logits), np.arange(len(labels))
+    losses = np.stack([np.minimum(-log_p(t)[labels, numbers], MOST_LOSS) for t in TEMPERATURES])
     best = losses[losses.mean(axis=1).argmin()]
     for temperature, loss in zip(TEMPERATURES, losses, strict=True):
         worse = loss - best
@@ -89,8 +96,14 @@ def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float
     raise AssertionError("the best temperature is within an error of itself")
 
 
-def _log_losses(logits: Array, labels: Array) -> Array:
-    """Log loss [n] of each sweep."""
-    p = softmax(logits)[np.arange(len(labels)), labels]
-    losses: Array = -np.log(np.maximum(p, LEAST_PROBABILITY))
-    return losses
+def _cooled(logits: Array) -> Callable[[float], Array]:
+    """Gives the log probabilities [K, n] at a temperature. Sums over the few materials are five
+    times as fast along the first axis."""
+    away = np.ascontiguousarray((logits - logits.max(axis=1, keepdims=True)).T, np.float64)
+
+    def log_p(temperature: float) -> Array:
+        z = away / temperature
+        found: Array = z - np.log(np.exp(z).sum(axis=0))
+        return found
+
+    return log_p
