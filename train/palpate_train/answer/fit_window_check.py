@@ -1,5 +1,7 @@
-"""Limits of the window check for a skin whose own good sweeps are beyond the usual ones: coarse
-counts stand still under a load, dead taxels never change, a strong press reaches full scale."""
+"""Limits of the window check, fitted to a skin that exceeds the usual limits in good sweeps.
+
+Coarse counts stand still under a load, dead taxels never change, a strong press reaches full
+scale."""
 
 from __future__ import annotations
 

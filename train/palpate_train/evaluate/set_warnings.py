@@ -1,4 +1,4 @@
-"""Warnings about what a sweep set or a protocol makes look better or worse than it is."""
+"""Warnings about a sweep set or a protocol that flatters a method, or wrongs it."""
 
 from __future__ import annotations
 

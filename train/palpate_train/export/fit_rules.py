@@ -171,8 +171,8 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
 
 def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -> Bundle:
     """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
-    that do not pay. Heads judge that have not seen the held-out sweeps. On a skin whose sound
-    sweeps have taxels without a signal, broken ones cannot be told from these."""
+    that do not pay. Heads judge that have not seen the held-out sweeps. A skin may have taxels
+    without a signal in sound sweeps; no broken taxel is bridged on it."""
     left_out, figures = list(asked.left_out), dict[str, Any]()
     seed = int(content.about.get("seed", 0))
     if proven:
