@@ -20,7 +20,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data import raw_files
 from palpate_train.data.extras import library
 from palpate_train.data.files import parquet
-from palpate_train.data.files.table import Table, excerpt, from_columns
+from palpate_train.data.files.table import Column, Table, excerpt, from_columns, parted
 from palpate_train.data.import_plan import ImportPlan, grid_shape
 
 INFO = Path("meta", "info.json")
@@ -167,8 +167,7 @@ def _table(
     if found is None:
         raise FormatError(f"{name} does not hold numbers; name a feature that does")
     flat = _apart(name, found.reshape(len(found), -1), each)
-    names = [f"{name}.{k}" for k in range(flat.shape[1])]
-    columns, texts = list(flat.T), {}
+    columns: list[Column] = list(parted(name, flat))
     for field in dict.fromkeys([TASK, *fields]):
         if field == TASK and TASK_INDEX in rows.column_names:
             numbers = rows.column(TASK_INDEX).to_pylist()
@@ -177,14 +176,12 @@ def _table(
             given = [str(value) for value in rows.column(field).to_pylist()]
         else:
             continue
-        texts[len(names)] = [text for text in given for _ in range(each)]
-        names.append(field)
-        columns.append(np.zeros(len(flat), np.uint8))
-    made = from_columns(names, columns, texts)
+        columns.append((field, [text for text in given for _ in range(each)]))
+    made = from_columns(columns)
     timed = TIME in rows.column_names and each == 1
     time = parquet.numbers(rows.column(TIME), TIME) if timed else None
     vectors = {} if time is None else {TIME: time.astype(np.float64)}
-    return Table(made.values, made.columns, vectors, tuple(vectors), texts)
+    return replace(made, vectors=vectors, beside=tuple(vectors))
 
 
 def _apart(name: str, rows: NDArray[Any], each: int) -> NDArray[Any]:

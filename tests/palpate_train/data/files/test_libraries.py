@@ -249,8 +249,8 @@ def test_a_topic_of_texts_gives_labels(tmp_path: Path, kind: str, late: int):
     if kind != "bag":
         (path,) = path.glob(f"*.{kind}")
     found = raw_files.read(path, ReadPlan(fields=("/note",)))
-    assert found.texts[4] == LABELS[late:]
-    np.testing.assert_array_equal(found.values[:, :4], SKIN[late:])
+    assert found.labels["/note"] == LABELS[late:]
+    np.testing.assert_array_equal(found.values, SKIN[late:])
     np.testing.assert_allclose(found.vectors["received"], TIMES[late:])
     assert len(found.notes) == (late > 0)
     with pytest.raises(FormatError, match="/skin"):

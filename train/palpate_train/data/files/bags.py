@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate.core.text import printable
 from palpate_train.data.extras import library
 from palpate_train.data.files import mcap_json
-from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal
+from palpate_train.data.files.table import (
+    Array,
+    ReadPlan,
+    Table,
+    from_columns,
+    labelled,
+    normal,
+    only,
+)
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 WHAT = "a recording of ROS"
@@ -59,18 +66,10 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         topics: dict[str, list[Any]] = {}
         for connection in bag.connections:
             topics.setdefault(normal(connection.topic), []).append(connection)
-        listed = ", ".join(f"{printable(t)} ({c[0].msgtype})" for t, c in topics.items())
-        name = normal(wanted.variable)
-        if name and name not in topics:
-            raise FormatError(f"has no topic {name!r}; it holds {listed or 'nothing'}")
-        fitting = [name] if name else _fitting(bag, topics)
-        if len(fitting) != 1:
-            raise FormatError(
-                f"holds {len(fitting)} topics of frames; name one with --variable: "
-                f"it holds {listed or 'nothing'}"
-            )
+        types = {name: connections[0].msgtype for name, connections in topics.items()}
+        name = only("topic", types, wanted.variable, lambda n: _fits(bag, topics[n]))
         labels = {name: topics[name] for name in wanted.fields if name in topics}
-        return _table(bag, topics[fitting[0]], labels)
+        return _table(bag, topics[name], labels)
 
 
 @contextmanager
@@ -111,20 +110,16 @@ WHOLE = {".mcap": _has_end, ".db3": _has_all_pages}
 """Whether a recording has its end, by the ending of its name, for formats that tell it."""
 
 
-def _fitting(bag: Any, topics: dict[str, list[Any]]) -> list[str]:
-    """The topics whose first message holds several numbers beside its header."""
-    found = []
-    for topic, connections in topics.items():
-        for connection, _, raw in bag.messages(connections=connections):
-            try:
-                message = bag.deserialize(raw, connection.msgtype)
-            except Exception:  # a type whose definition the file lacks is not a topic of frames
-                break
-            sizes = [np.size(v) for k, v in _numbers("", message) if STAMP not in k]
-            if 1 < sum(sizes) <= MOST:
-                found.append(topic)
-            break
-    return found
+def _fits(bag: Any, connections: list[Any]) -> bool:
+    """Whether the first message of a topic holds several numbers beside its header."""
+    for connection, _, raw in bag.messages(connections=connections):
+        try:
+            message = bag.deserialize(raw, connection.msgtype)
+        except Exception:  # a type whose definition the file lacks is not a topic of frames
+            return False
+        sizes = [np.size(v) for k, v in _numbers("", message) if STAMP not in k]
+        return 1 < sum(sizes) <= MOST
+    return False
 
 
 def _table(bag: Any, connections: list[Any], labels: Mapping[str, list[Any]]) -> Table:
@@ -163,44 +158,21 @@ def _table(bag: Any, connections: list[Any], labels: Mapping[str, list[Any]]) ->
     times = {RECEIVED: 1e-9 * (np.array(received) - received[0])}
     if len(stamps) == len(rows) and any(stamps):
         times[TIME] = np.array(stamps) - stamps[0]
-    texts = {name: _labels(bag, name, labels[name], received) for name in labels}
-    return _labelled(names, np.stack(rows), times, texts)
+    table = from_columns(list(zip(names, np.stack(rows).T, strict=True)))
+    table = replace(table, vectors=times, beside=tuple(times))
+    return labelled(table, received, {name: _texts(bag, name, labels[name]) for name in labels})
 
 
-def _labelled(
-    names: Sequence[str],
-    rows: Array,
-    times: Mapping[str, Array],
-    texts: Mapping[str, tuple[list[str], int]],
-) -> Table:
-    """The table from the first frame on that has all labels."""
-    first = max((before for _, before in texts.values()), default=0)
-    said = [f"{first} frames before the first label are left out"] * (first > 0)
-    columns = [*rows[first:].T, *(np.zeros(len(rows) - first, np.uint8) for _ in texts)]
-    of_columns = {len(names) + k: text[first:] for k, (text, _) in enumerate(texts.values())}
-    table = from_columns([*names, *texts], columns, of_columns, said)
-    vectors = {name: values[first:] for name, values in times.items()}
-    return replace(table, vectors=vectors, beside=tuple(vectors))
-
-
-def _labels(
-    bag: Any, topic: str, connections: list[Any], received: Sequence[int]
-) -> tuple[list[str], int]:
-    """The last text of a topic at each time of `received`, and the number of times before the first
-    text. Raises FormatError for messages without a text or a number in `data`."""
-    at: list[int] = []
-    texts: list[str] = []
+def _texts(bag: Any, topic: str, connections: list[Any]) -> list[tuple[int, str]]:
+    """Times and texts of a topic. Raises FormatError for messages without a text or a number in
+    `data`."""
+    texts: list[tuple[int, str]] = []
     for connection, t_ns, raw in bag.messages(connections=connections):
         value = getattr(bag.deserialize(raw, connection.msgtype), "data", None)
         if not isinstance(value, str | int | float):
             raise FormatError(f"{topic} holds {connection.msgtype}; --field needs std_msgs/String")
-        at.append(t_ns)
-        texts.append(str(value))
-    which = np.searchsorted(at, received, side="right") - 1
-    before = int((which < 0).sum())
-    if before == len(received):
-        raise FormatError(f"{topic} says nothing before the last frame; say labels earlier")
-    return [texts[k] if k >= 0 else "" for k in which], before
+        texts.append((t_ns, str(value)))
+    return texts
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:

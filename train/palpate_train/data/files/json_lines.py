@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.files.table import (
-    Array,
+    Column,
     ReadPlan,
     Table,
     excerpt,
@@ -159,8 +159,7 @@ def table_of(
 ) -> Table:
     """A table of frames with their numbers. what: how a message calls one. Raises FormatError."""
     names = list(frames[0][1])
-    columns: list[Array] = []
-    texts: dict[int, list[str]] = {}
+    columns: list[Column] = []
     faults: dict[int, str] = {}
     for i, frame in frames:
         if list(frame) != names and set(frame) != set(names):
@@ -171,12 +170,11 @@ def table_of(
         values = [frame[name] for _, frame in frames]
         words = sum(isinstance(value, str) for value in values)
         if 2 * words > len(values):
-            texts[k] = list(map(str, values))
-            columns.append(np.zeros(len(values), np.uint8))
+            columns.append((name, list(map(str, values))))
             continue
         numbers = [v if isinstance(v, int | float) else None for v in values]
         for (i, _), number, value in zip(frames, numbers, values, strict=True):
             if number is None:
                 faults.setdefault(k, f"{what} {i}, {name} is {value!r}, which is not a number")
-        columns.append(np.array([np.nan if v is None else v for v in numbers], np.float64))
-    return replace(from_columns(names, columns, texts, notes), faults=faults)
+        columns.append((name, np.array([np.nan if v is None else v for v in numbers], np.float64)))
+    return from_columns(columns, notes, faults)

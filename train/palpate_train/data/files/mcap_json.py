@@ -14,7 +14,7 @@ from palpate.core.errors import FormatError
 from palpate.core.text import printable
 from palpate_train.data.extras import library
 from palpate_train.data.files.json_lines import flat, table_of
-from palpate_train.data.files.table import ReadPlan, Table, normal
+from palpate_train.data.files.table import ReadPlan, Table, labelled, normal, only
 
 JSON = "json"
 MAGIC_BYTES = 8
@@ -41,29 +41,18 @@ def read(path: Path, wanted: ReadPlan) -> Table | None:
     topics = _topics(path)
     if not topics:
         return None
-    listed = ", ".join(f"{printable(name)} (JSON)" for name in topics)
-    name = normal(wanted.variable)
-    if name and name not in topics:
-        raise FormatError(f"has no topic {name!r}; it holds {listed}")
-    fitting = [name] if name else [n for n, messages in topics.items() if _numbers(messages) > 1]
-    if len(fitting) != 1:
-        raise FormatError(
-            f"holds {len(fitting)} topics of frames; name one with --variable: it holds {listed}"
-        )
-    messages = topics[fitting[0]]
-    at_ns = np.array([t_ns for t_ns, _ in messages], np.int64)
-    labels = {n: _latest(n, topics[n], at_ns) for n in wanted.fields if n in topics}
-    first = max((texts.count("") for texts in labels.values()), default=0)
-    rows = [(i, dict(flat("", value))) for i, (_, value) in enumerate(messages, 1)][first:]
-    if not rows:
-        raise FormatError(f"{', '.join(labels)} says nothing before the last frame; say it earlier")
-    notes = [f"{first} frames before the first label are left out"] * (first > 0)
-    return replace(
-        table_of(rows, "message", notes),
-        vectors={TIME: 1e-9 * (at_ns[first:] - at_ns[first])},
+    known = dict.fromkeys(topics, "JSON")
+    name = only("topic", known, wanted.variable, lambda n: _numbers(topics[n]) > 1)
+    messages = topics[name]
+    at_ns = [t_ns for t_ns, _ in messages]
+    rows = [(i, dict(flat("", value))) for i, (_, value) in enumerate(messages, 1)]
+    table = replace(
+        table_of(rows, "message", ()),
+        vectors={TIME: 1e-9 * (np.array(at_ns) - at_ns[0])},
         beside=(TIME,),
-        labels={n: texts[first:] for n, texts in labels.items()},
     )
+    said = {n: _texts(n, topics[n]) for n in wanted.fields if n in topics}
+    return labelled(table, at_ns, said)
 
 
 def _topics(path: Path) -> dict[str, list[Message]]:
@@ -88,13 +77,12 @@ def _numbers(messages: list[Message]) -> int:
     return sum(type(value) in (int, float) for _, value in flat("", messages[0][1]))
 
 
-def _latest(name: str, messages: list[Message], at_ns: Any) -> list[str]:
-    """The last text of a topic at each of these times, "" before the first."""
-    texts: list[str] = []
-    for _, value in messages:
+def _texts(name: str, messages: list[Message]) -> list[tuple[int, str]]:
+    """Times and texts of a topic. Raises FormatError for a message with another number of texts."""
+    texts: list[tuple[int, str]] = []
+    for t_ns, value in messages:
         said = [text for _, text in flat("", value) if isinstance(text, str)]
         if len(said) != 1:
             raise FormatError(f"{name} holds {len(said)} texts in a message; --field needs one")
-        texts += said
-    which = np.searchsorted([t_ns for t_ns, _ in messages], at_ns, side="right") - 1
-    return [texts[k] if k >= 0 else "" for k in which]
+        texts.append((t_ns, said[0]))
+    return texts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns
+from palpate_train.data.files.table import Array, Column, ReadPlan, Table, from_columns, parted
 
 SUFFIXES = (".parquet", ".pq", ".feather", ".arrow")
 
@@ -34,9 +33,7 @@ def arrow(path: Path, columns: Sequence[str] | None = None) -> Any:
 
 def table(content: Any) -> Table:
     """The numbers and texts of pyarrow's table. Columns of other types are passed over."""
-    names: list[str] = []
-    columns: list[Array] = []
-    texts: dict[int, list[str]] = {}
+    columns: list[Column] = []
     faults: dict[int, str] = {}
     left: list[str] = []
     while any(str(kind).startswith("struct") for kind in content.schema.types):
@@ -44,26 +41,22 @@ def table(content: Any) -> Table:
     for name in content.column_names:
         values, kind = content.column(name), str(content.column(name).type)
         if kind.startswith(("string", "large_string", "dictionary", "date", "timestamp[")):
-            texts[len(names)] = [str(v) for v in values.to_pylist()]
-            columns.append(np.zeros(len(values), np.uint8))
-            names.append(name)
+            columns.append((name, [str(v) for v in values.to_pylist()]))
             continue
         try:
             found = numbers(values, name)
         except FormatError as e:  # another column may hold the skin
-            found, faults[len(names)] = np.full(len(values), np.nan), str(e)
+            found, faults[len(columns)] = np.full(len(values), np.nan), str(e)
         if found is None:
             left.append(name)
             continue
-        flat = found.reshape(len(found), -1)
-        for k in range(flat.shape[1]):
-            if values.null_count:
-                row = values.to_pylist().index(None) + 1
-                faults[len(names)] = f"row {row} of {name} is empty"
-            columns.append(flat[:, k])
-            names.append(name if found.ndim == 1 else f"{name}.{k}")
-    notes = [f"column {n} is passed over" for n in left]
-    return replace(from_columns(names, columns, texts, notes), faults=faults)
+        several = parted(name, found)
+        if values.null_count:
+            row = values.to_pylist().index(None) + 1
+            numbered = range(len(columns), len(columns) + len(several))
+            faults |= dict.fromkeys(numbered, f"row {row} of {name} is empty")
+        columns += several
+    return from_columns(columns, [f"column {n} is passed over" for n in left], faults)
 
 
 def numbers(values: Any, name: str) -> Array | None:

@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,6 +17,8 @@ from palpate.core.errors import FormatError
 from palpate.core.text import printable
 
 Array = NDArray[Any]
+Column = tuple[str, Array | list[str]]
+"""Name of a column, and its numbers [n] or its texts."""
 TIME = "time"
 """The vector of the times that a file states by the interval between two frames, in s."""
 MOST_LISTED = 12
@@ -193,9 +195,8 @@ def _columns(numbers: Mapping[str, Entry], time: str) -> Table | None:
     if len(vectors) < 2:
         return None
     usual = Counter(entry.size for entry in vectors.values()).most_common(1)[0][0]
-    kept = {n: e.read().ravel() for n, e in vectors.items() if e.size == usual}
-    note = f"its {len(kept)} arrays of {usual} numbers are its columns"
-    return from_columns(list(kept), list(kept.values()), {}, [note])
+    kept = [(n, e.read().ravel()) for n, e in vectors.items() if e.size == usual]
+    return from_columns(kept, [f"its {len(kept)} arrays of {usual} numbers are its columns"])
 
 
 def _listed(numbers: Mapping[str, Entry]) -> str:
@@ -212,41 +213,91 @@ def _listed(numbers: Mapping[str, Entry]) -> str:
 def records(values: Array) -> Table:
     """A table of a record array [n]: one column for each number of a field, one text column for
     each field of text. Fields of other kinds are passed over."""
-    names: list[str] = []
-    columns: list[Array] = []
-    texts: dict[int, list[str]] = {}
+    columns: list[Column] = []
     left: list[str] = []
     for name in values.dtype.names or ():
         part = values[name]
         if part.dtype.kind in "biuf":
-            flat = part.reshape(len(part), -1)
-            columns += list(flat.T)
-            names += [name] if part.ndim == 1 else [f"{name}.{i}" for i in range(flat.shape[1])]
+            columns += parted(name, part)
         elif part.dtype.kind in "SUO" and part.ndim == 1:
-            texts[len(names)] = [
-                t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t) for t in part
-            ]
-            columns.append(np.full(len(part), np.nan, np.float32))
-            names.append(name)
+            columns.append((name, as_texts(part)))
         else:
             left.append(name)
-    return from_columns(names, columns, texts, [f"field {n} is passed over" for n in left])
+    return from_columns(columns, [f"field {n} is passed over" for n in left])
+
+
+def parted(name: str, values: Array) -> list[Column]:
+    """The numbers [n, ...] of a field as columns: `name`, or `name.0` and so on if they are several
+    for each frame."""
+    if values.ndim == 1:
+        return [(name, values)]
+    return [(f"{name}.{k}", column) for k, column in enumerate(values.reshape(len(values), -1).T)]
+
+
+def as_texts(values: Iterable[Any]) -> list[str]:
+    """Values as texts; bytes are read as UTF-8."""
+    return [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values]
 
 
 def from_columns(
-    names: Sequence[str],
-    columns: Sequence[Array],
-    texts: Mapping[int, Sequence[str]],
-    notes: Sequence[str] = (),
+    columns: Sequence[Column], notes: Sequence[str] = (), faults: Mapping[int, str] | None = None
 ) -> Table:
-    """A table of columns [n] of equal length, in the smallest type that holds all numbers."""
+    """A table of columns of equal length, in the smallest type that holds all numbers. faults: as
+    in Table. Raises FormatError if no column holds numbers."""
+    names = [normal(name) for name, _ in columns]
+    texts = {i: found for i, (_, found) in enumerate(columns) if isinstance(found, list)}
     if len(texts) == len(columns):
         raise FormatError(f"holds no numbers; its columns are {', '.join(names) or 'none'}")
-    kinds = [c.dtype for i, c in enumerate(columns) if i not in texts]
+    kinds = [found.dtype for _, found in columns if not isinstance(found, list)]
     common = np.result_type(*kinds)
     if common.kind == "b":
         common = np.dtype(np.uint8)
-    values = np.empty((len(columns[0]), len(columns)), common)
-    for i, column in enumerate(columns):
+    values = np.empty((len(columns[0][1]), len(columns)), common)
+    for i, (_, column) in enumerate(columns):
         values[:, i] = 0 if i in texts else column
-    return Table(values, tuple(map(normal, names)), texts=dict(texts), notes=tuple(notes))
+    return Table(values, tuple(names), texts=texts, faults=faults or {}, notes=tuple(notes))
+
+
+def labelled(
+    table: Table, at_ns: Sequence[int], said: Mapping[str, Sequence[tuple[int, str]]]
+) -> Table:
+    """The table with `labels`: of each topic in `said`, its times in ns and texts, the last text
+    before a frame. at_ns: times of the frames.
+
+    Frames before the first label are left out. Raises FormatError if none is left.
+    """
+    labels, first = dict[str, list[str]](), 0
+    for topic, texts in said.items():
+        which = np.searchsorted([t_ns for t_ns, _ in texts], at_ns, side="right") - 1
+        if (before := int((which < 0).sum())) == len(at_ns):
+            raise FormatError(f"{topic} says nothing before the last frame; say labels earlier")
+        labels[topic] = [texts[k][1] for k in which]
+        first = max(first, before)
+    note = f"{first} frames before the first label are left out"
+    return replace(
+        table,
+        values=table.values[first:],
+        vectors={name: times[first:] for name, times in table.vectors.items()},
+        texts={column: texts[first:] for column, texts in table.texts.items()},
+        notes=(*table.notes, *[note] * (first > 0)),
+        labels={topic: texts[first:] for topic, texts in labels.items()},
+    )
+
+
+def only(what: str, known: Mapping[str, str], variable: str, fits: Callable[[str], bool]) -> str:
+    """The name among `known` that `variable` asks for, else the only one that `fits`.
+
+    what: these parts of a file in the singular, such as topic. known: a remark on each, "" for
+    none. Raises FormatError that lists them.
+    """
+    name = normal(variable)
+    told = [f"{printable(n)} ({remark})" if remark else printable(n) for n, remark in known.items()]
+    listed = ", ".join(told) or "nothing"
+    if name and name not in known:
+        raise FormatError(f"has no {what} {name!r}; it holds {listed}")
+    fitting = [name] if name else list(filter(fits, known))
+    if len(fitting) != 1:
+        raise FormatError(
+            f"holds {len(fitting)} {what}s of frames; name one with --variable: it holds {listed}"
+        )
+    return fitting[0]

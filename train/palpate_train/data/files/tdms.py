@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal, timed
+from palpate_train.data.files.table import ReadPlan, Table, from_columns, normal, only, timed
 
 STEP = "wf_increment"
 
@@ -25,15 +23,7 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     with nptdms.TdmsFile.open(path) as file:
         groups = {normal(group.name): group for group in file.groups()}
         groups = {n: g for n, g in groups.items() if any(_is_numeric(c) for c in g.channels())}
-        name = normal(wanted.variable)
-        if name and name not in groups:
-            raise FormatError(f"has no group {name!r}; it holds {', '.join(groups) or 'nothing'}")
-        if not name and len(groups) != 1:
-            raise FormatError(
-                f"holds {len(groups)} groups with numbers, {', '.join(groups) or 'none'}; "
-                "name one with --variable"
-            )
-        group = groups[name or next(iter(groups))]
+        group = groups[only("group", dict.fromkeys(groups, ""), wanted.variable, lambda _: True)]
         facts = {normal(k): str(v) for k, v in {**file.properties, **group.properties}.items()}
         return replace(_table(group), facts=facts)
 
@@ -55,14 +45,7 @@ def _table(group: Any) -> Table:
         f"{k} is left out: it has {n} values, not {usual}" for k, n in lengths.items() if n != usual
     ]
     kept = [c for c in kept if len(c) == usual]
-    columns: list[Array] = []
-    texts: dict[int, list[str]] = {}
-    for k, channel in enumerate(kept):
-        values = channel[:]
-        if not _is_numeric(channel):
-            texts[k] = list(map(str, values))
-            values = np.zeros(len(values), np.uint8)
-        columns.append(values)
-    made = from_columns([c.name for c in kept], columns, texts, notes)
+    columns = [(c.name, c[:] if _is_numeric(c) else list(map(str, c[:]))) for c in kept]
+    made = from_columns(columns, notes)
     steps = {str(step) for c in kept if (step := c.properties.get(STEP))}
     return timed(made, STEP, steps.pop()) if len(steps) == 1 else made

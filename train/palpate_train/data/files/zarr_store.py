@@ -15,7 +15,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, as_texts, chosen, normal
 
 SUFFIXES = (".zarr",)
 ROOTS = (".zgroup", ".zarray", "zarr.json")
@@ -80,10 +80,7 @@ def _labels(
             _all(arrays[name]).ravel() for name in names if arrays[name].size in (count, len(ends))
         ]
         if len(values) == 1 and len(names) == 1:
-            texts = [
-                t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t)
-                for t in values[0].tolist()
-            ]
+            texts = as_texts(values[0].tolist())
             of_episodes = len(texts) == len(ends) and len(texts) != count
             repeats = np.diff([0, *ends]).tolist() if of_episodes else [1] * count
             found[field] = [text for text, n in zip(texts, repeats, strict=True) for _ in range(n)]
