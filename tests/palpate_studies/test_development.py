@@ -27,7 +27,6 @@ from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.models import methods
-from palpate_train.reports.plot_style import SVG
 from tests.factories.development_data import SERIES, case, entry, figures, timed, times
 from tests.factories.page_reader import PageReader
 from tests.factories.paths import ROOT
@@ -46,7 +45,7 @@ def shown(made: dict[str, Any]) -> str:
 
 def texts(svg: str) -> list[str]:
     """All texts of a picture."""
-    return [node.text or "" for node in ElementTree.fromstring(svg).iter(f"{{{SVG}}}text")]
+    return [node.text or "" for node in ElementTree.fromstring(svg).findall(".//{*}text")]
 
 
 def spot(method: str, ms: float, mean: float, form: str = "", **more: Any) -> Spot:

@@ -13,6 +13,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
+from palpate_train.onnx_tools.graph_builder import GraphModel
 from tests.factories.later import Later
 
 baselines = Later("palpate_studies.peers.baselines")
@@ -56,7 +57,7 @@ def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
         + [0, 100, 0, 0, 9]
     )
     estimator = ESTIMATORS[name]().fit(x[:60], y[:60])
-    model = baselines.FeatureModel(baselines.to_onnx(estimator, 6, 1.7))
+    model = GraphModel(baselines.to_onnx(estimator, 6, 1.7))
     unseen = x[60:].astype(np.float32)
     if "knn" in name:
         scores = np.log(4 * estimator.predict_proba(unseen) + 0.1)
@@ -94,7 +95,7 @@ def test_gauss_is_a_normal_distribution():
     x = np.array([[0.0, 0, 7], [1, 1, 7], [5, 5, 7]])
     gauss = baselines.Gauss().fit(x, np.arange(3))
     assert gauss.predict(x + 0.1).tolist() == [0, 1, 2]
-    assert np.isfinite(baselines.FeatureModel(baselines.to_onnx(gauss, 3)).logits(x)).all()
+    assert np.isfinite(GraphModel(baselines.to_onnx(gauss, 3)).logits(x.astype(np.float32))).all()
 
 
 def folds_of(sweeps: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -125,7 +126,7 @@ def test_without_anything_to_hold_out_the_temperature_is_one(tubes: Dataset, giv
     """One recording of each material: no folds, and the plain estimator's logits."""
     sweeps = replace(tubes, groups={"recording": tubes.labels})
     assert not folds_of(sweeps)
-    want = baselines.FeatureModel(
+    want = GraphModel(
         baselines.to_onnx(baselines.Gauss().fit(given.astype(float), sweeps.labels), 6)
     ).logits(given)
     np.testing.assert_array_equal(

@@ -118,7 +118,7 @@ def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(logits.argmax(1), want)
 
 
-def head(sweeps: Dataset) -> linear_head.LinearHeadModel:
+def head(sweeps: Dataset) -> graph_builder.GraphModel:
     """A ridge on made-up features, which need no aeon."""
     graph = minirocket.transform(sweeps.format, parameters(sweeps.format.window, 4))
     return linear_head.train_linear_head(graph, minirocket._ridge, sweeps, sweeps.samples, 0)

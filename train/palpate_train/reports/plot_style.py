@@ -7,9 +7,10 @@ a page sets for light and dark. A picture outside of a page has plain colours.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
-from xml.etree import ElementTree
+from xml.sax.saxutils import escape
 
 import numpy as np
 from matplotlib import rc_context
@@ -63,11 +64,17 @@ def _variables(roles: Mapping[str, str]) -> str:
 LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
 AXIS = "axis:"
 """Prefix of the id of an axis with numbers while it is drawn; the axis title follows."""
-SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
-NUMBERS = {"x", "y", "x1", "y1", "x2", "y2", "width", "height"}
-"""Attributes that hold one coordinate."""
-ElementTree.register_namespace("", SVG)
-ElementTree.register_namespace("xlink", XLINK)
+REWRITTEN = (
+    (r' (width|height)="[\d.]+pt"', ""),  # as wide as the page
+    (r"<defs>\s*<style.*?</style>\s*</defs>", ""),  # it would be that of the whole page
+    (rf'<g id="{AXIS}', '<g data-axis="'),
+    (r'<g id="[^"]*"', "<g"),  # two pictures of a page would share them
+    (r' transform="rotate\(-?0 [^"]*"', ""),
+    (r"font-family: [^;\"]*;? ?", ""),
+    (r"\n\s*", "\n"),
+)
+"""What is replaced in matplotlib's SVG."""
+COORDINATES = re.compile(r'\b(d|[xy][12]?|width|height)="[^"]*"')
 
 
 class TickFormatter(Formatter):
@@ -204,20 +211,14 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
         figure.savefig(
             file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
         )
-    root = ElementTree.fromstring(file.getvalue())
-    for style in root.findall(f"{{{SVG}}}defs[{{{SVG}}}style]"):
-        root.remove(style)  # a style sheet would be that of the whole page
-    _drop_empty_groups(root)
-    for element in root.iter():
-        _restyle(element, {} if plain else COLOURS)
-    for name in ("width", "height"):
-        root.attrib.pop(name)  # as wide as the page
-    root.attrib |= {"role": "img", "font-family": FONT, "stroke-linejoin": "round"}
-    title = ElementTree.Element(f"{{{SVG}}}title")
-    title.text = about
-    root.insert(0, title)
-    ElementTree.indent(root, space="")
-    return ElementTree.tostring(root, encoding="unicode")
+    svg = file.getvalue().partition("<svg ")[2]
+    for pattern, text in REWRITTEN:
+        svg = re.sub(pattern, text, svg, flags=re.DOTALL)
+    svg = COORDINATES.sub(_short, svg)
+    if not plain:
+        svg = re.sub("#[0-9a-f]{6}", lambda found: COLOURS.get(found[0], found[0]), svg)
+    svg = f'<svg role="img" font-family="{FONT}" stroke-linejoin="round" {svg}'
+    return svg.replace(">", f"><title>{escape(about)}</title>", 1)
 
 
 def _named(axis: Axis, shared: str) -> str | None:
@@ -230,44 +231,9 @@ def _named(axis: Axis, shared: str) -> str | None:
     return AXIS + (axis.get_label_text() or shared)
 
 
-def _drop_empty_groups(parent: ElementTree.Element) -> None:
-    """Remove the empty groups of ticks without length."""
-    for child in list(parent):
-        _drop_empty_groups(child)
-        if child.tag == f"{{{SVG}}}g" and not len(child):
-            parent.remove(child)
-
-
-def _restyle(element: ElementTree.Element, colours: Mapping[str, str]) -> None:
-    """Replace colours by `colours`; remove matplotlib's fonts and the names of groups; round
-    coordinates to a precision that can be seen."""
-    attributes = element.attrib
-    if element.tag == f"{{{SVG}}}g":
-        name = attributes.pop("id", "")  # two pictures of a page would share them
-        if name.startswith(AXIS):
-            attributes["data-axis"] = name.removeprefix(AXIS)
-    if "style" in attributes:
-        parts = (part.partition(":") for part in attributes["style"].split(";"))
-        pairs = {
-            name.strip(): value.strip() for name, _, value in parts if name.strip() != "font-family"
-        }
-        attributes["style"] = "; ".join(
-            f"{name}: {colours.get(value, value)}" for name, value in pairs.items() if name
-        )
-    for name in NUMBERS & attributes.keys():
-        attributes[name] = _short(attributes[name])
-    if "d" in attributes:
-        attributes["d"] = " ".join(
-            part if part.isalpha() else _short(part) for part in attributes["d"].split()
-        )
-    if attributes.get("transform", "").startswith(("rotate(-0 ", "rotate(0 ")):
-        del attributes["transform"]
-
-
-def _short(number: str) -> str:
-    """A coordinate with at most PLACES decimals; numbers with a unit are unchanged."""
-    try:
-        text = f"{float(number):.{PLACES}f}".rstrip("0").rstrip(".")
-    except ValueError:
-        return number
-    return "0" if text == "-0" else text
+def _short(coordinates: re.Match[str]) -> str:
+    """An attribute with at most PLACES decimals in each number."""
+    numbers = re.sub(
+        r"\d+\.\d+", lambda n: f"{float(n[0]):.{PLACES}f}".rstrip("0").rstrip("."), coordinates[0]
+    )
+    return " ".join(numbers.split())

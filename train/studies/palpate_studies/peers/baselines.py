@@ -11,7 +11,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from typing import Any, Protocol, Self
@@ -31,11 +30,10 @@ from sklearn.svm import SVC
 
 from palpate.answer.objects import LEAST_PROBABILITY
 from palpate.core.errors import FormatError
-from palpate.inference.session import session
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models.methods import Method
-from palpate_train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder
+from palpate_train.onnx_tools.graph_builder import IR, OPSET, GraphBuilder, GraphModel
 
 Array = NDArray[Any]
 NEIGHBOURS = 4
@@ -142,30 +140,7 @@ def knn() -> KNeighborsClassifier:
     return KNeighborsClassifier(NEIGHBOURS)
 
 
-@dataclass(frozen=True)
-class FeatureModel:
-    """A trained method on features: its graph, `features` float32 [1, F] -> `logits` float32 [1,
-    K]."""
-
-    model: onnx.ModelProto
-
-    def graph(self) -> onnx.ModelProto:
-        """The graph for the box."""
-        return self.model
-
-    def logits(self, inputs: Array) -> Array:
-        """Features float32 [n, F] -> log probabilities float32 [n, K], from the graph, one by one
-        as on the box."""
-        run = session(self.model.SerializeToString())
-        classes = self.model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-        rows = [
-            run.run(None, {"features": row[None]})[0][0]
-            for row in inputs.astype(np.float32, copy=False)
-        ]
-        return np.array(rows, np.float32).reshape(-1, classes)
-
-
-def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: int) -> FeatureModel:
+def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: int) -> GraphModel:
     """Train an estimator of `make` on `inputs`, features float32 [N, F] of `sweeps`. `seed` is
     unused because nothing is random.
 
@@ -182,11 +157,11 @@ def learn(make: Callable[[], Estimator], sweeps: Dataset, inputs: Array, seed: i
     held_out, held_out_labels = [np.empty((0, classes))], [labels[:0]]
     for train, test in _folds(sweeps):
         estimator = make().fit(features[train], labels[train])
-        held_out.append(FeatureModel(to_onnx(estimator, classes)).logits(inputs[test]))
+        held_out.append(GraphModel(to_onnx(estimator, classes)).logits(inputs[test]))
         held_out_labels.append(labels[test])
     logits, truth = np.concatenate(held_out), np.concatenate(held_out_labels)
     temperature = platt_temperature(SHARPENING * logits, truth) / SHARPENING if len(logits) else 1.0
-    return FeatureModel(to_onnx(make().fit(features, labels), classes, temperature))
+    return GraphModel(to_onnx(make().fit(features, labels), classes, temperature))
 
 
 def _folds(sweeps: Dataset) -> Iterator[tuple[Array, Array]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,34 +18,13 @@ from numpy.typing import NDArray
 from palpate.core.errors import FormatError
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature
-from palpate_train.models.linear_head import ABSENT, hold_out
-from palpate_train.onnx_tools.graph_builder import run, with_head
+from palpate_train.models.linear_head import expanded_head, hold_out
+from palpate_train.onnx_tools.graph_builder import GraphModel, run, with_head
 
 Array = NDArray[Any]
 SHARPENING = 30.0
 """Factor on margins before `platt_temperature`, which only softens: margins are about 1 and have to
 be sharpened."""
-
-
-@dataclass(frozen=True, eq=False)
-class LinearHeadModel:
-    """A trained model: features that a graph computes, and a linear head with the temperature
-    folded in.
-
-    features: `sweep` [1, T, R, C] -> `features` float32 [1, F]. weight [K, F], bias [K]: float32.
-    """
-
-    features: onnx.ModelProto
-    weight: Array
-    bias: Array
-
-    def logits(self, inputs: Array) -> Array:
-        """Raw counts [n, T, R, C] -> logits float32 [n, K], from the graph that the box runs."""
-        return run(self.graph(), inputs)
-
-    def graph(self) -> onnx.ModelProto:
-        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
-        return with_head(self.features, self.weight, self.bias)
 
 
 def train_linear_head(
@@ -54,7 +33,7 @@ def train_linear_head(
     sweeps: Dataset,
     inputs: Array,
     seed: int,
-) -> LinearHeadModel:
+) -> GraphModel:
     """The graph `features` with a linear head, trained on `inputs`, the raw counts [N, T, R, C] of
     `sweeps`.
 
@@ -71,11 +50,10 @@ def train_linear_head(
         weight, bias = _centred(*fit(computed[train], labels[train]))
         margins = computed[held_out] @ weight.T + bias
         factor = SHARPENING / platt_temperature(SHARPENING * margins, labels[held_out])
-    all_weight = np.zeros((len(sweeps.materials), computed.shape[1]), np.float32)
-    all_bias = np.full(len(sweeps.materials), ABSENT, np.float32)
     weight, bias = _centred(*fit(computed, labels))
-    all_weight[present], all_bias[present] = weight * factor, bias * factor
-    return LinearHeadModel(features, all_weight, all_bias)
+    classes = len(sweeps.materials)
+    whole = expanded_head(weight * factor, bias * factor, present, classes)
+    return GraphModel(with_head(features, *whole))
 
 
 def _centred(coefficients: Array, intercepts: Array) -> tuple[Array, Array]:

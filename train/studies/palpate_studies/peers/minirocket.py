@@ -21,10 +21,10 @@ from sklearn.preprocessing import StandardScaler
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.aeon_peers import series, undisturbed
-from palpate_studies.peers.linear_head import LinearHeadModel, train_linear_head
+from palpate_studies.peers.linear_head import train_linear_head
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
-from palpate_train.onnx_tools.graph_builder import GraphBuilder
+from palpate_train.onnx_tools.graph_builder import GraphBuilder, GraphModel
 
 Array = NDArray[Any]
 LENGTH, KERNELS = 9, np.array(list(combinations(range(9), 3)))
@@ -37,7 +37,7 @@ ALPHAS = np.logspace(-3, 3, 10)
 authors' code."""
 
 
-def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
+def train(sweeps: Dataset, inputs: Array, seed: int) -> GraphModel:
     """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError if aeon is missing, if a window is shorter than a kernel, or if `sweeps` are

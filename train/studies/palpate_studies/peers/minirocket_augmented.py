@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate_studies.peers import minirocket
-from palpate_studies.peers.linear_head import LinearHeadModel
 from palpate_train.data.augment import SLOW, Augmentation, copies, default_augmentation
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
 from palpate_train.models.recipe.architectures import STAGES
+from palpate_train.onnx_tools.graph_builder import GraphModel
 
 Array = NDArray[Any]
 COPIES = 2
 """Number of copies of each training sweep, as many as the heads of the recipe see."""
 
 
-def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
+def train(sweeps: Dataset, inputs: Array, seed: int) -> GraphModel:
     """MiniRocket and ridge on `inputs`, the raw counts [N, T, R, C] of `sweeps`, and COPIES of
     them.
 

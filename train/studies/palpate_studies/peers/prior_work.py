@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate_studies.peers.baselines import ABSENT, Estimator, FeatureModel, Gauss, learn, svm
+from palpate_studies.peers.baselines import ABSENT, Estimator, Gauss, learn, svm
 from palpate_studies.peers.prior_features import correlation, spectrogram, static
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
+from palpate_train.onnx_tools.graph_builder import GraphModel
 
 Array = NDArray[Any]
 Features = Callable[[Array, float], Array]
@@ -34,7 +35,7 @@ class OnFeatures:
 
     features: Features
     rate_hz: float
-    model: FeatureModel
+    model: GraphModel
 
     def logits(self, inputs: Array) -> Array:
         """Raw counts [n, T, R, C] -> log probabilities float32 [n, K]."""

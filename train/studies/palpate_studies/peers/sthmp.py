@@ -25,10 +25,10 @@ from sklearn.svm import LinearSVC
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate_studies.peers.linear_head import LinearHeadModel, train_linear_head
+from palpate_studies.peers.linear_head import train_linear_head
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
-from palpate_train.onnx_tools.graph_builder import GraphBuilder, run
+from palpate_train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
 
 Array = NDArray[Any]
 FRAMES, SIDE, STEP = 16, 2, 8
@@ -52,7 +52,7 @@ CONTRAST = 0.1
 """Added to a cell's squared length, as in HMP: a silent cell stays silent."""
 
 
-def train(sweeps: Dataset, inputs: Array, seed: int) -> LinearHeadModel:
+def train(sweeps: Dataset, inputs: Array, seed: int) -> GraphModel:
     """ST-HMP and a linear SVM on `inputs`, the raw counts [N, T, R, C] of `sweeps`.
 
     Raises FormatError if a window is too short, or if `sweeps` are too few.
