@@ -45,7 +45,7 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
         ends.append(lambda: loop.call_soon_threadsafe(stop.end, 0))
         return stop
 
-    class Flag(threading.Event):
+    class StopSwitch(threading.Event):
         exit_code = 0
         __call__ = threading.Event.is_set
 
@@ -64,7 +64,7 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(serve, "stop_event", stop_event)
         patched.setattr(serve, "_say", lambda args, server, box: there.set_result(server.address))
-        patched.setattr(command, "StopFlag", Flag)
+        patched.setattr(command, "StopFlag", StopSwitch)
         threading.Thread(target=work, daemon=True).start()
         try:
             address = there.result(LONG_S)
