@@ -117,13 +117,16 @@ class Gathering:
         if missing < 0 or (missing == 0 and not self._rises()):
             self.waste(end)
         elif missing == 0:
-            between = end - self.begun - self._held
-            self.garbage += between
-            self.numbers.append(np.concatenate([part for _, part in self._parts]))
-            self.ends.append(end)
-            self.skipped.append(self._before + between)
-            self.size, self.begun = end - self.begun, end
-            self._before, self._held, self._parts = 0, 0, []
+            self.frame(end, [part for _, part in self._parts], end - self.begun - self._held)
+
+    def frame(self, end: int, numbers: list[NDArray[Any]], between: int = 0) -> None:
+        """A whole frame up to `end`. between: garbage among its parts."""
+        self.garbage += between
+        self.numbers.append(np.concatenate(numbers))
+        self.ends.append(end)
+        self.skipped.append(self._before + between)
+        self.size, self.begun = end - self.begun, end
+        self._before, self._held, self._parts = 0, 0, []
 
     def _rises(self) -> bool:
         """Whether no part is missing: indices count parts, numbers or bytes."""

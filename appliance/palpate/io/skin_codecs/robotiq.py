@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate.io.skin_codecs.frames import Decoded, Rest, collected
+from palpate.io.skin_codecs.frames import Decoded, Gathering, Rest
 from palpate.io.skin_profile import SkinProfile
 
 _TSF_START = b"\x9a\x00"
@@ -22,33 +19,27 @@ pressure, accelerometer, gyroscope, magnetometer, temperature, time stamp."""
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Packets of fields without a checksum; a packet ends where the next begins. A frame is
     complete with the grids of all fingers, in one packet or in several."""
-    data = rest.data + new
+    data, frames = rest.data + new, Gathering(profile)
     fingers = profile.rows * profile.cols // _TSF_TAXELS
-    numbers: list[NDArray[Any]] = []
-    ends: list[int] = []
-    skipped: list[int] = []
     grids: dict[int, bytes] = {}
-    at = begun = garbage = before = size = 0  # begun: beginning of the packets of the current frame
+    at = 0
     while (end := _tsf_end(data, at)) != 0:
         fields = _tsf_fields(data[at + _TSF_HEADER : end]) if end > 0 else None
-        whole = fields is not None and not grids.keys() & fields.keys()
-        upto = at + 1 if fields is None else at if not whole else begun
-        # no packet, or a finger's grid is missing: the current frame is incomplete
-        if upto > begun:
-            garbage, before, begun, grids = garbage + upto - begun, before + upto - begun, upto, {}
         if fields is None:
-            found = data.find(_TSF_START, begun)
+            found = data.find(_TSF_START, at + 1)
             at = found if found >= 0 else len(data) - data.endswith(_TSF_START[:1])
-            garbage, before, begun = garbage + at - begun, before + at - begun, at
+        if fields is None or grids.keys() & fields.keys():
+            # no packet, or a finger's grid is missing: the current frame is incomplete
+            frames.waste(at)
+            grids = {}
+        if fields is None:
             continue
         grids |= {finger: grid for finger, grid in fields.items() if finger < fingers}
         at = end
         if len(grids) == fingers:
-            numbers.append(np.frombuffer(b"".join(grids[i] for i in sorted(grids)), ">u2"))
-            ends.append(end)
-            skipped.append(before)
-            size, before, grids, begun = end - begun, 0, {}, end
-    return collected(profile, numbers, ends, skipped, garbage, Rest(data[begun:]), size)
+            frames.frame(end, [np.frombuffer(grids[i], ">u2") for i in sorted(grids)])
+            grids = {}
+    return frames.decoded(data)
 
 
 def _tsf_end(data: bytes, at: int) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Gathering, Rest, collected
+from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Gathering, Rest
 from palpate.io.skin_profile import SkinProfile
 
 SEPARATORS, BRACKETS = b",;\t\r ", b"[](){}"
@@ -59,16 +59,12 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     data, mark, prefix = rest.data + new, profile.line_end.encode(), profile.prefix.encode()
     per_line = profile.cols * profile.values * (profile.rows if profile.lines == "frames" else 1)
     lines = 1 if profile.lines == "frames" else profile.rows
-    numbers: list[NDArray[Any]] = []
-    ends: list[int] = []
-    skipped: list[int] = []
+    frames, at, broken, misfit = Gathering(profile), 0, False, ""
     rows: list[NDArray[Any]] = []
-    at = begun = garbage = before = size = 0  # begun: where the lines in `rows` begin
-    broken, misfit = False, ""
     while (end := data.find(mark, at)) >= 0:
-        line, at = data[at:end], end + 1
+        line, begin, at = data[at:end], at, end + 1
         if prefix and prefix not in line:
-            begun = at  # another line, which is no garbage
+            frames.passed_over(begin, at)
             continue
         row, why = _numbers(profile, line, per_line)
         misfit = why or misfit
@@ -80,17 +76,13 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         if not closed:
             continue
         if len(rows) == lines and not broken:
-            numbers.append(np.concatenate(rows))
-            ends.append(at)
-            skipped.append(before)
-            size, before = at - begun, 0
+            frames.frame(at, rows)
         else:
-            garbage, before = garbage + at - begun, before + at - begun
-        rows, begun, broken = [], at, False
-    if len(data) - begun > MOST_PACKET * lines:
-        garbage, begun = garbage + len(data) - begun, len(data)
-    left = Rest(data[begun:])
-    return collected(profile, numbers, ends, skipped, garbage, left, size, misfit=misfit)
+            frames.waste(at)
+        rows, broken = [], False
+    if len(data) - frames.begun > MOST_PACKET * lines:
+        frames.waste(len(data))
+    return frames.decoded(data, misfit)
 
 
 def _indexed(profile: SkinProfile, data: bytes) -> Decoded:
