@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 
 from palpate.bridges import modbus_pdu as pdu
 from palpate.bridges.modbus_pdu import (
@@ -21,7 +22,6 @@ from palpate.bridges.modbus_pdu import (
 )
 from palpate.bridges.server import TcpPeer
 from palpate.bridges.source import BoxView, Source
-from palpate.client.answers import Answer
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.log import SparseLog
@@ -57,12 +57,13 @@ class Register:
     words: int = 1
 
 
-def _of_answer(get: Callable[[Answer], float]) -> Callable[[BoxView], int]:
-    return lambda view: round(get(view.answer)) if view.answer else 0
+def _of_answer(name: str, steps: int = 1) -> Callable[[BoxView], int]:
+    """An entry for a number of the answer, in steps of its unit; 0 without it."""
+    return lambda view: round(steps * (getattr(view.answer, name, 0) or 0))
 
 
 def _of_state(name: str) -> Callable[[BoxView], int]:
-    return lambda view: getattr(view.state, name) if view.state else 0
+    return lambda view: getattr(view.state, name, 0)
 
 
 def _state_code(view: BoxView) -> int:
@@ -70,26 +71,41 @@ def _state_code(view: BoxView) -> int:
     return STATES.index(skin) + 1 if skin in STATES else 0
 
 
+def _name(view: BoxView) -> int:
+    """The first eight letters of the finger's name."""
+    name = view.answer.finger if view.answer else ""
+    return int.from_bytes(name.encode("ascii", "replace")[:8].ljust(8, b"\0"), "big")
+
+
+def _direction(view: BoxView) -> int:
+    """1 + index in DIRECTIONS; 0: it was not measured."""
+    direction = view.answer.direction if view.answer else ""
+    return DIRECTIONS.index(direction) + 1 if direction in DIRECTIONS else 0
+
+
+STATUS = Register("status", lambda view: STATUS_CODES[view.answer.status] if view.answer else 0)
+LABEL_CODE = Register(
+    "label code",
+    lambda view: view.code(view.answer.label) if view.answer and view.answer.known else 0,
+)
+PROBABILITY = Register("probability", _of_answer("probability", 1000))
 REGISTERS = (
     Register("map version", lambda view: VERSION),
     Register("heartbeat", lambda view: view.beats),
     Register("state of the skin", _state_code),
     Register("answers", lambda view: view.answers),
-    Register("status", lambda view: STATUS_CODES[view.answer.status] if view.answer else 0),
-    Register(
-        "label code",
-        lambda view: view.code(view.answer.label) if view.answer and view.answer.known else 0,
-    ),
+    STATUS,
+    LABEL_CODE,
     Register(
         "likeliest label code", lambda view: view.code(view.answer.label) if view.answer else 0
     ),
-    Register("probability", _of_answer(lambda answer: 1000 * answer.probability)),
-    Register("margin", _of_answer(lambda answer: 1000 * answer.margin)),
-    Register("latency", _of_answer(lambda answer: 100 * answer.latency_ms)),
-    Register("early", _of_answer(lambda answer: answer.early)),
-    Register("fused", _of_answer(lambda answer: answer.fused)),
-    Register("lost in the window", _of_answer(lambda answer: answer.lost)),
-    Register("sweep", _of_answer(lambda answer: answer.sweep), 2),
+    PROBABILITY,
+    Register("margin", _of_answer("margin", 1000)),
+    Register("latency", _of_answer("latency_ms", 100)),
+    Register("early", _of_answer("early")),
+    Register("fused", _of_answer("fused")),
+    Register("lost in the window", _of_answer("lost")),
+    Register("sweep", _of_answer("sweep"), 2),
     Register("answered", _of_state("answered"), 2),
     Register("frames", _of_state("frames"), 2),
     Register("lost frames", _of_state("lost_frames"), 2),
@@ -108,51 +124,13 @@ command START has them, and the steps of a register in one mm/s or N."""
 SLIDE_AT = ADDRESSES["label"] + LABEL_WORDS
 
 
-def _direction_code(answer: Answer) -> int:
-    """1 + index in DIRECTIONS; 0: it was not measured."""
-    return DIRECTIONS.index(answer.direction) + 1 if answer.direction in DIRECTIONS else 0
-
-
 MEASURED = (
-    Register("measured speed", _of_answer(lambda answer: 10 * (answer.measured_mm_s or 0))),
-    Register("direction", _of_answer(_direction_code)),
+    Register("measured speed", _of_answer("measured_mm_s", 10)),
+    Register("direction", _direction),
 )
 """The entries after the registers of SLIDE."""
-
-
-def _of_finger(i: int, get: Callable[[BoxView, Answer], int]) -> Callable[[BoxView], int]:
-    """An entry of the finger with this index; 0 if there is none."""
-
-    def value(view: BoxView) -> int:
-        there = view.answer and i < len(view.answer.fingers)
-        return get(view, view.answer.fingers[i]) if view.answer and there else 0
-
-    return value
-
-
-def _name(view: BoxView, finger: Answer) -> int:
-    return int.from_bytes(finger.finger.encode("ascii", "replace")[:8].ljust(8, b"\0"), "big")
-
-
-FINGERS = (
-    Register("fingers", lambda view: len(view.answer.fingers) if view.answer else 0),
-    *(
-        register
-        for i in range(MOST_FINGERS)
-        for register in (
-            Register(f"finger {i + 1}", _of_finger(i, _name), 4),
-            Register(f"status {i + 1}", _of_finger(i, lambda view, of: STATUS_CODES[of.status])),
-            Register(
-                f"label code {i + 1}",
-                _of_finger(i, lambda view, of: view.code(of.label) if of.known else 0),
-            ),
-            Register(
-                f"probability {i + 1}", _of_finger(i, lambda view, of: round(1000 * of.probability))
-            ),
-        )
-    ),
-)
-"""The last entries of the map: the answers of the fingers."""
+FINGER = Register("finger", _name, 4), STATUS, LABEL_CODE, PROBABILITY
+"""The last entries of the map, for each finger; before them stands the number of fingers."""
 COUNTERS = (
     *("heartbeat", "answers", "sweep", "answered"),
     *("frames", "lost frames", "missed answers", "damaged sentences"),
@@ -168,6 +146,14 @@ def _words(entries: Sequence[Register], view: BoxView) -> list[int]:
         value = value % top if register.name in COUNTERS else min(value, top - 1)
         words += [value >> 16 * i & 0xFFFF for i in reversed(range(register.words))]
     return words
+
+
+def _finger_words(view: BoxView) -> list[int]:
+    """The number of fingers, and the words of MOST_FINGERS; 0 for a finger that is not there."""
+    fingers = view.answer.fingers if view.answer else ()
+    each = (*fingers, *[None] * (MOST_FINGERS - len(fingers)))
+    words = [_words(FINGER, replace(view, answer=one)) for one in each[:MOST_FINGERS]]
+    return [len(fingers), *chain.from_iterable(words)]
 
 
 def registers(view: BoxView, *, alive: bool) -> list[int]:
@@ -235,11 +221,10 @@ class ModbusBridge:
             return [bool(coil) for coil in coils]
         view = self._source.view()
         alive = view.alive(self._clock.now_ns())
-        return (
-            inputs(view, alive=alive)
-            if function == pdu.READ_INPUTS
-            else [*registers(view, alive=alive), *slide, *_words((*MEASURED, *FINGERS), view)]
-        )
+        if function == pdu.READ_INPUTS:
+            return inputs(view, alive=alive)
+        last = *_words(MEASURED, view), *_finger_words(view)
+        return [*registers(view, alive=alive), *slide, *last]
 
     async def _write(self, wanted: Writing, coils: list[bool | None], slide: list[int]) -> None:
         if not self._writes:

@@ -229,8 +229,8 @@ class FeedServer(Observer):
                 self._poll.modify(reader.connection, 0)
             return
         for request in asked:
-            if request.frames_hz is not None:
-                reader.frames_hz = min(request.frames_hz, self._most_hz)
+            if request.frames is not None:
+                reader.frames_hz = min(request.frames, self._most_hz)
             if request.sweeps is not None:
                 reader.sweeps = request.sweeps
 

@@ -14,9 +14,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from math import isfinite
-from typing import Any
+from typing import Annotated, Any
 
 from palpate.core.errors import FormatError
+from palpate.core.schema import Within, typed
 from palpate.core.types import Sweep
 
 QUEUE_BYTES = 768 * 1024
@@ -37,10 +38,10 @@ _PARTS = 64
 
 @dataclass(frozen=True, slots=True)
 class FeedRequest:
-    """A request of a reader. frames_hz: frames a second, 0 for none. sweeps: whether the reader
-    gets the windows of sweeps. None leaves the earlier request as it is."""
+    """A request of a reader. frames: frames a second, 0 for none. sweeps: whether the reader gets
+    the windows of sweeps. None leaves the earlier request as it is."""
 
-    frames_hz: float | None = None
+    frames: Annotated[float, Within(0, MOST_HZ)] | None = None
     sweeps: bool | None = None
 
 
@@ -57,21 +58,16 @@ def requests(data: bytes, rest: bytes = b"") -> tuple[list[FeedRequest], bytes]:
 
 
 def _request(line: bytes) -> FeedRequest:
-    advice = 'send {"frames": HZ} or {"sweeps": true}, as in PROTOCOL.md, part 4'
     try:
         asked = json.loads(line)
-    except (ValueError, RecursionError) as e:
-        raise FormatError(f"{_shown(line)} is not json; {advice}") from e
-    if not isinstance(asked, dict) or not asked or not asked.keys() <= {"frames", "sweeps"}:
-        raise FormatError(f"{_shown(line)} is not a request; {advice}")
-    hz, sweeps = asked.get("frames", 0), asked.get("sweeps", False)
-    if type(hz) not in (int, float) or not 0 <= hz <= MOST_HZ:
-        raise FormatError(f"{_shown(line)}: give frames a second as a number from 0 to {MOST_HZ:g}")
-    if type(sweeps) is not bool:
-        raise FormatError(f"{_shown(line)}: give sweeps as true or false")
-    return FeedRequest(
-        float(hz) if "frames" in asked else None, sweeps if "sweeps" in asked else None
-    )
+        if asked == {} or None in asked.values():
+            raise TypeError("it holds nothing")
+        return typed(FeedRequest, asked)
+    except (ValueError, TypeError, AttributeError, RecursionError) as e:
+        raise FormatError(
+            f'{_shown(line)} is not a request; send json: {{"frames": HZ}}, 0 to {MOST_HZ:g} a '
+            'second, or {"sweeps": true or false}'
+        ) from e
 
 
 def _shown(line: bytes) -> str:
