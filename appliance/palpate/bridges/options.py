@@ -4,12 +4,13 @@ bridge."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from palpate.core.config import Config, SerialConfig, StoreConfig
 from palpate.core.errors import ConfigError
+from palpate.core.outputs import Row, add_options
 
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
@@ -22,82 +23,6 @@ FEED_KINDS = ("modbus", "mqtt", "opcua")
 """Bridges that can read the feed, as long as nobody commands."""
 SETTINGS = ("allow_writes", "short", "anonymous", "broker", "login", "ca", "name")
 """Options of some bridges, and settings of the same names."""
-TEXTS = {
-    "tcp": "the sentences of the serial line on a TCP port",
-    "modbus": "the box as a Modbus TCP server",
-    "opcua": "the box as an OPC UA server",
-    "mqtt": "the box at an MQTT broker, with Home Assistant's discovery",
-    "memory": "every verdict of 90 days in a file, for palpate status --since",
-    "ros": "the box as a ROS 2 node",
-    "fuse": "the answers of several fingers, each with a unit of its own, as those of one hand",
-}
-
-
-def add_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the kinds of bridges, with the options of each."""
-    kinds = command.add_subparsers(dest="kind", metavar="KIND", required=True)
-    for kind, text in TEXTS.items():
-        one = kinds.add_parser(kind, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        add = one.add_argument
-        if kind == "ros":
-            text = "parameters and names of ROS; the last option"
-            add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text)
-            continue
-        if kind == "memory":
-            add("--feed", metavar="PATH", help="the box's feed (store.runtime)")
-            add("--file", type=Path, metavar="FILE", help="SQLite (bridge.memory)")
-            continue
-        text = f"baud rate of the serial line (default {BAUD})"
-        add("--baud", type=int, default=BAUD, metavar="N", help=text)
-        if kind == "fuse":
-            text = "2 to 4 units, as in palpate@NAME, or the paths of their feeds (bridge.fingers)"
-            add("--fingers", nargs="+", metavar="NAME[=FEED]", help=text)
-            add("--port", metavar="PORT", help="the serial line to the robot (serial.port)")
-        else:
-            _add_ways(one, kind)
-            text = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
-            one.add_argument("--allow-writes", action="store_true", help=text)
-            _add_broker(one) if kind == "mqtt" else _add_server(one, kind)
-
-
-def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
-    """Add the ways to the box."""
-    way = one.add_mutually_exclusive_group()
-    text = "the box's serial line: a device, or socket://HOST:PORT"
-    way.add_argument("--port", metavar="PORT", help=text)
-    text = f"on the box: make the link PATH; default if serial.port is {LINKS[kind]}"
-    way.add_argument("--link", type=Path, metavar="PATH", help=text)
-    one.set_defaults(feed=None)
-    if kind in FEED_KINDS:
-        text = f"on the box: read the feed at PATH (default {FEED})"
-        way.add_argument("--feed", nargs="?", const=FEED, metavar="PATH", help=text)
-
-
-def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
-    text = f"default: bridge.address of the settings, and port {PORTS[kind]}"
-    one.add_argument("--listen", metavar="HOST:PORT", help=text)
-    if kind == "tcp":
-        text = "sentences of at most 80 characters, without their last fields (bridge.short)"
-        one.add_argument("--short", action="store_true", help=text)
-    if kind == "opcua":
-        text = "its certificate, and `login`: user on one line, password on the next (bridge.opcua)"
-        one.add_argument("--folder", type=Path, metavar="DIR", help=text)
-        text = "everybody may read, also without encryption (bridge.anonymous)"
-        one.add_argument("--anonymous", action="store_true", help=text)
-        text = "of the box; default: of the computer (bridge.name)"
-        one.add_argument("--name", metavar="NAME", help=text)
-    text = f"most connections at a time (default {MOST})"
-    one.add_argument("--most", type=_number, default=MOST, metavar="N", help=text)
-
-
-def _add_broker(one: argparse.ArgumentParser) -> None:
-    for name, metavar, text in (
-        ("broker", "URL", "mqtt://HOST:PORT, or mqtts://HOST:PORT for TLS (bridge.broker)"),
-        ("login", "FILE", "user on its first line, password on its second (bridge.login)"),
-        ("ca", "FILE", "certificates to trust; default: those of the system (bridge.ca)"),
-        ("name", "NAME", "of the box, in topics; default: of the computer (bridge.name)"),
-    ):
-        one.add_argument(f"--{name}", metavar=metavar, help=text)
 
 
 def _number(text: str) -> int:
@@ -105,6 +30,72 @@ def _number(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 1000:
         raise argparse.ArgumentTypeError(f"{text} is not a number of connections; use 1 to 1000")
     return int(text)
+
+
+_LINE = "the box's serial line: a device, or socket://HOST:PORT"
+_FLAG = {"action": "store_true"}
+_PATH = {"type": Path, "metavar": "PATH"}
+# fmt: off
+OPTIONS: Mapping[str, Row] = {
+    "baud": ("--baud", f"baud rate of the serial line (default {BAUD})",
+        {"type": int, "default": BAUD, "metavar": "N"}),
+    "port": ("--port", _LINE, {"metavar": "PORT"}),
+    "link": ("--link", "on the box: make the link PATH (default if serial.port is"
+        " /run/palpate-KIND/line)", _PATH),
+    "feed": ("--feed", f"on the box: read the feed at PATH (default {FEED})",
+        {"nargs": "?", "const": FEED, "metavar": "PATH"}),
+    "writes": ("--allow-writes",
+        "peers may start, stop, tare and abort, even if bridge.allow_writes is false", _FLAG),
+    "listen": ("--listen", "default: bridge.address of the settings, and port "
+        + ", ".join(f"{port} ({kind})" for kind, port in PORTS.items()), {"metavar": "HOST:PORT"}),
+    "most": ("--most", f"most connections at a time (default {MOST})",
+        {"type": _number, "default": MOST, "metavar": "N"}),
+    "short": ("--short",
+        "sentences of at most 80 characters, without their last fields (bridge.short)", _FLAG),
+    "folder": ("--folder", "its certificate, and `login`: user on one line, password on the next"
+        " (bridge.opcua)", _PATH),
+    "anonymous": ("--anonymous",
+        "everybody may read, also without encryption (bridge.anonymous)", _FLAG),
+    "name": ("--name", "of the box; default: of the computer (bridge.name)", {"metavar": "NAME"}),
+    "broker": ("--broker", "mqtt://HOST:PORT, or mqtts://HOST:PORT for TLS (bridge.broker)",
+        {"metavar": "URL"}),
+    "login": ("--login", "user on its first line, password on its second (bridge.login)",
+        {"metavar": "FILE"}),
+    "ca": ("--ca", "certificates to trust; default: those of the system (bridge.ca)",
+        {"metavar": "FILE"}),
+    "of-box": ("--feed", "the box's feed (store.runtime)", {"metavar": "PATH"}),
+    "file": ("--file", "SQLite (bridge.memory)", _PATH),
+    "fingers": ("--fingers",
+        "2 to 4 units, as in palpate@NAME, or the paths of their feeds (bridge.fingers)",
+        {"nargs": "+", "metavar": "NAME[=FEED]"}),
+    "robot": ("--port", "the serial line to the robot (serial.port)", {"metavar": "PORT"}),
+    "ros": ("--ros-args", "parameters and names of ROS; the last option",
+        {"nargs": argparse.REMAINDER, "default": [], "metavar": "..."}),
+}
+KINDS: Mapping[str, tuple[str, str]] = {
+    "tcp": ("the sentences of the serial line on a TCP port",
+        "baud port|link writes listen short most"),
+    "modbus": ("the box as a Modbus TCP server", "baud port|link|feed writes listen most"),
+    "opcua": ("the box as an OPC UA server",
+        "baud port|link|feed writes listen folder anonymous name most"),
+    "mqtt": ("the box at an MQTT broker, with Home Assistant's discovery",
+        "baud port|link|feed writes broker login ca name"),
+    "memory": ("every verdict of 90 days in a file, for palpate status --since", "of-box file"),
+    "ros": ("the box as a ROS 2 node", "ros"),
+    "fuse": ("the answers of several fingers, each with a unit of its own, as those of one hand",
+        "baud fingers robot"),
+}
+# fmt: on
+"""The kinds of bridges: what each offers, and its options."""
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the kinds of bridges, with the options of each."""
+    kinds = command.add_subparsers(dest="kind", metavar="KIND", required=True)
+    for kind, (text, names) in KINDS.items():
+        one = kinds.add_parser(kind, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        one.set_defaults(feed=None)
+        add_options(one, names, OPTIONS)
 
 
 def read_login(path: Path) -> tuple[str, str]:

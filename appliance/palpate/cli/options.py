@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import outputs
+from palpate.core.outputs import Row
 
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of the pages of `palpate watch`; and of `palpate record` or `palpate teach`, which
@@ -41,7 +42,6 @@ def _span(text: str) -> float:
     return int(text[:-1]) * unit
 
 
-_Row = tuple[str, str, dict[str, Any]]
 _FLAG = {"action": "store_true"}
 _FOLDER, _FILE = {"type": outputs.folder, "metavar": "DIR"}, {"type": Path, "metavar": "FILE"}
 _LEAST_S, _LEAST_WINDOW = partial(_seconds, least=0.1), partial(_seconds, least=0.01)
@@ -61,17 +61,17 @@ def _time(kind: Callable[[str], float], metavar: str = "S") -> dict[str, Any]:
     return {"type": kind, "metavar": metavar, "default": None}
 
 
-def _web(help: str, port: int = WEB_PORT) -> _Row:
+def _web(help: str, port: int = WEB_PORT) -> Row:
     text = f"{help} (default port {port})"
     return "--web", text, {"nargs": "?", "const": port, "type": int, "metavar": "PORT"}
 
 
-def _instead(name: str, run: str, help: str) -> _Row:
+def _instead(name: str, run: str, help: str) -> Row:
     return name, help, {"action": "store_const", "dest": "run", "const": run}
 
 
 # fmt: off
-OPTIONS: Mapping[str, _Row] = {
+OPTIONS: Mapping[str, Row] = {
     "sim": ("--sim", "simulated tubes, one of them, a finger at rest on one, or a sweep set,"
         " instead of the devices", _text("skin[:MATERIAL]|rest|replay:FILE", None)),
     "skin": ("--skin", "profile of the skin, or its file (skin.profile)", _text("NAME", None)),
@@ -137,15 +137,6 @@ OPTIONS: Mapping[str, _Row] = {
 }
 # fmt: on
 """Options by name: flag, help, and the rest as argparse has it."""
-
-
-def add(command: argparse.ArgumentParser, names: str) -> None:
-    """Add options by their names in OPTIONS; names with | between them exclude each other."""
-    for word in names.split():
-        group: Any = command.add_mutually_exclusive_group() if "|" in word else command
-        for name in word.split("|"):
-            flag, help, how = OPTIONS[name]
-            group.add_argument(flag, help=help, **how)
 
 
 def add_settings(command: argparse.ArgumentParser) -> None:

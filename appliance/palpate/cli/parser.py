@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from palpate import __version__
 from palpate.cli import options
+from palpate.core.outputs import add_options
 
 EXIT_CODES = """\
 exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong
@@ -20,7 +21,7 @@ Parser = argparse.ArgumentParser
 
 class CommandEntry(NamedTuple):
     """A command. run: its function below `palpate`, imported when it is called. options: see
-    `options.add`. actions: its actions, if it has any."""
+    `add_options`. actions: its actions, if it has any."""
 
     text: str
     run: str
@@ -128,7 +129,7 @@ def _add(subparsers: Any, name: str, command: CommandEntry) -> None:
         add_arguments(one)
     else:
         options.add_settings(one)
-    options.add(one, command.options)
+    add_options(one, command.options, options.OPTIONS)
     one.set_defaults(run=command.run)
     if command.actions:
         actions = one.add_subparsers(dest="action", metavar="ACTION", required=not command.run)

@@ -1,17 +1,30 @@
-"""Types of options that name a new folder or file: an ending that belongs to something else is
-refused while the command line is read, before any work."""
+"""Options of command lines: from a table, and types of those that name a new folder or file. An
+ending that belongs to something else is refused while the command line is read, before any work."""
 
 from __future__ import annotations
 
-from argparse import ArgumentTypeError
-from collections.abc import Callable
+from argparse import ArgumentParser, ArgumentTypeError
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
+
+Row = tuple[str, str, dict[str, Any]]
+"""An option: its flag, its help, and the rest as argparse has it."""
 
 OF_FILES = (
     ".csv", ".h5", ".hdf5", ".html", ".json", ".jsonl", ".mat", ".md", ".npy", ".npz", ".onnx",
     ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx", ".zip",
 )  # fmt: skip
 """Endings that no folder has. Others may be part of its name, as in bundle-1.2."""
+
+
+def add_options(command: ArgumentParser, names: str, table: Mapping[str, Row]) -> None:
+    """Add options by their names in `table`; names with | between them exclude each other."""
+    for word in names.split():
+        group: Any = command.add_mutually_exclusive_group() if "|" in word else command
+        for name in word.split("|"):
+            flag, help, how = table[name]
+            group.add_argument(flag, help=help, **how)
 
 
 def folder(text: str) -> Path:
