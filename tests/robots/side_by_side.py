@@ -310,20 +310,14 @@ def table(content: dict[str, Any]) -> str:
         f"{content['machine']}{', with real-time priority' * content['real_time']};",
         f"load average {content['load']:.1f}; commit {content['commit'][:12]}.",
         "",
-        "| box | frames lost | answers | in the box, p50 / p99 / most "
-        "| verdict to line, p50 / p99 / most | edge to answer, later than the median: p99 / most "
+        "| box | frames lost | answers | verdict to line, p50 / p99 / most "
         "| share of a core | memory: before, most |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|",
     ]
     for name, one in boxes.items():
-        within, way = (
-            "{p50:.1f} / {p99:.1f} / {max:.1f} ms".format(**one[f"{kind}_ms"])
-            for kind in ("latency", "way")
-        )
-        edge = "{p99:.1f} / {max:.1f} ms".format(**one["edge_ms"])
+        way = "{p50:.1f} / {p99:.1f} / {max:.1f} ms".format(**one["way_ms"])
         rows.append(
-            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {within} | {way} "
-            f"| {edge} "
+            f"| {NAMES[name]} | {one['frames_lost']} | {one['answers']} | {way} "
             f"| {100 * one['share']:.2f} % | {one['before_mib']}, {one['most_mib']} MiB |"
         )
     bore = [f"{kind} {seen['attempts']:,}" for kind, seen in peers.items()]
@@ -334,8 +328,7 @@ def table(content: dict[str, Any]) -> str:
     ]
     rows += [
         "",
-        f"Hostile connections: {', '.join(bore)}. "
-        f"Meanwhile one good peer of each got answers: {', '.join(good)}.",
+        f"Hostile connections: {', '.join(bore)}; answers to one good peer: {', '.join(good)}.",
     ]
     return "\n".join(rows)
 

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """A row for each rule, that is left out."""
+def table(results: Mapping[str, Any], pairs: bool = True) -> str:
+    """A row for each rule that is left out, with `pairs` also for each pair of rules."""
     first, *others = results["rows"]
+    others = [row for row in others if pairs or len(row["without"]) == 1]
     kinds = list(first["total"])
     totals = ", ".join(f"{first['total'][kind]:,} {kind}" for kind in kinds)
     head = ["without", *(f"{kind}: right, wrong" for kind in kinds[:-1]), "junk with a label"]

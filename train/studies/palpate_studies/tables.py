@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +48,13 @@ JUNK = {
 }
 """Texts of the groups of kinds in the campaign `junk`."""
 STRANGERS = {
-    "material near foam": "foam with every property up to a fifth larger or smaller",
+    "material near foam": "foam with every property up to a fifth off",
     "felt": "felt: soft as foam, with a finer and shallower pattern",
-    "random material": "each property from one of two known materials, up to a third larger or "
-    "smaller",
-    "random material, 50 Hz hum": "the same, with hum of 50 Hz of half of the deviation",
+    "random material": "each property from one of two known materials, up to a third off",
+    "random material, 50 Hz hum": "the same, with 50 Hz hum of half of the deviation",
     "random material, noise": "the same, with as much noise",
     "random material, 35 % faster": "the same, 35 % faster than in training",
-    "random material, other skin": "the same on another skin: a fifth less sensitive, twice the "
-    "noise, more damping",
+    "random material, other skin": "the same on a less sensitive, noisier, more damped skin",
     "softness alone": "softness alone half larger or a third smaller",
     "roughness alone": "roughness alone, likewise",
     "vibration alone": "vibration alone, likewise",
@@ -113,7 +112,7 @@ TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     (SPECIFICATIONS, "bench", "bench", bench_table.table),
     (ALIGNMENT, "alignment", "alignment", contact_table.table),
     (RECIPE, "recipe", "recipe", recipe_page.table),
-    ("docs/how-to/train.md", "rules", "rules", rules_table.table),
+    ("docs/how-to/train.md", "rules", "rules", partial(rules_table.table, pairs=False)),
     (FABRICS, "matrix", "fabrics", matrix_table.headline),
     *(("docs/explanation/figures.md", *one) for one in quantities.TABLES),
 )
