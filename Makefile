@@ -63,7 +63,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train export build/default.npz --out appliance/palpate/default_bundle --name default \
 	  --version 3 --with displacement
 
-bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
+bench: $(TOOLS) ## measure this machine: docs/data/bench.json, and the tables of README and manual
 	$(BIN)/python -m tests.campaigns bench
 	$(BIN)/python -m palpate_studies tables
 
@@ -131,9 +131,10 @@ $(TOOLS): $(DESKTOP) tests/tools.lock train/studies/pyproject.toml
 	$(INSTALL) --no-build-isolation -e train/studies
 	@touch $@
 
-# The same with what builds the site.
-$(SITE): $(DESKTOP) docs/site/site.lock
+# The same with what builds the site; the studies draw its pages of results.
+$(SITE): $(DESKTOP) docs/site/site.lock train/studies/pyproject.toml
 	$(LOCKED) -r docs/site/site.lock
+	$(INSTALL) --no-deps --no-build-isolation -e train/studies
 	@touch $@
 
 # ROS 2 with palpate_msgs, in a virtual environment of its own.
