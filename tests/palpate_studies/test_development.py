@@ -22,7 +22,7 @@ from palpate_studies import (
 )
 from palpate_studies.command import main
 from palpate_studies.development_chart import ChartPanel, Spot
-from palpate_studies.study import Study, StudyCase, StudyRun, save
+from palpate_studies.study import StudyCase, StudyRun, save
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
@@ -159,7 +159,7 @@ def test_the_mean_of_tests_counts_one_set_once(files: tuple[str, str], away: flo
 
 def test_cases_and_methods_exist_and_have_words_for_people():
     """No protocol, published set or described method is shown by its name in commands."""
-    usual = set(development_experiment.usual_methods(development_experiment.STUDY))
+    usual = set(development_experiment.usual_methods())
     assert set(development_experiment.PEERS) < usual <= set(methods.every())
     assert method_names.NAMES.keys() <= methods.every().keys()
     assert method_names.plain_name("recurrent") == "recurrent"
@@ -194,8 +194,7 @@ def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[
     }
     where = Where(jobs=1, cache=folder / "cache")
     run = StudyRun(**({"where": where, "log": silent, "data": folder} | given))
-    study = Study("tones", cases, names)
-    return run, development_experiment.results(study, run, names)
+    return run, development_experiment.results(run, names, cases)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.storage import put
-from palpate_studies import marked_text
+from palpate_studies import markdown
 from palpate_train.reports import provenance
 from palpate_train.reports.formatting import estimate, percent
 
@@ -16,7 +16,7 @@ def write(path: Path, results: Json) -> None:
     """Put tables and header into the page. Raises FormatError without each marker once."""
     text = path.read_text("utf-8")
     for part, table in TABLES.items():
-        text = marked_text.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))
+        text = markdown.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))
     put(path, provenance.in_markdown(text, provenance.of(results)).encode())
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from palpate_studies import markdown
 from palpate_train.reports import provenance
 
 Json = dict[str, Any]
@@ -14,18 +15,9 @@ Json = dict[str, Any]
 def table(figures: Json) -> str:
     """The table with a caption. Figures of an older bundle are marked as such. Raises KeyError if a
     figure is missing."""
-    older = provenance.of(figures).older
-    rows = [f"| {what} | {value} |" for what, value in _rows(figures)]
-    return "\n".join(
-        [
-            *([f"**{older}**", ""] if older else []),
-            _caption(figures),
-            "",
-            "| what | measured |",
-            "|---|---|",
-            *rows,
-        ]
-    )
+    older, about = provenance.of(figures).older, _caption(figures)
+    about = f"**{older}**\n\n{about}" if older else about
+    return markdown.table(("what", "measured"), _rows(figures), about)
 
 
 def _caption(figures: Json) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from palpate_studies import markdown
 from palpate_train.reports.formatting import estimate
 
 Json = dict[str, Any]
@@ -47,11 +48,7 @@ def table(result: Json) -> str:
         f"of {result['other positions']['set']} at {result['other positions']['attachments']}, "
         "moved. Per cent [95 %], else sweeps."
     )
-    lines = [
-        f"| {' | '.join(row)} |"
-        for row in (HEAD, ("---",) * len(HEAD), *(_cells(*row) for row in rows))
-    ]
-    return "\n".join([caption, "", *lines])
+    return markdown.table(HEAD, (_cells(*row) for row in rows), caption)
 
 
 def _moved(result: Json) -> Iterator[tuple[str, Json]]:
@@ -61,13 +58,13 @@ def _moved(result: Json) -> Iterator[tuple[str, Json]]:
             yield from ((text, point) for point in points if point["mm"] == mm)
 
 
-def _cells(text: str, point: Json) -> tuple[str, ...]:
+def _cells(text: str, point: Json) -> tuple[object, ...]:
     return (
         text,
         estimate(point["accuracy"]),
         estimate(point["wrong_share"]),
-        str(point["unsure"]),
-        str(point["unknown"]),
+        point["unsure"],
+        point["unknown"],
         estimate(point["moved"], 0),
-        str(point["wrong_unflagged"]),
+        point["wrong_unflagged"],
     )

@@ -7,13 +7,13 @@ among the sets, because the simulator cannot be trusted with it (decision 2).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from palpate_studies.fabrics_experiment import FABRICS, FOUR, SEVEN
-from palpate_studies.study import NO_DATA, Study, StudyCase, StudyRun
+from palpate_studies.study import NO_DATA, StudyCase, StudyRun
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import evaluate
 from palpate_train.evaluate.evaluate import Plan
@@ -64,16 +64,15 @@ CASES = {
     TUBES: StudyCase(("sim:T-REAL/level-blind:1",), "leave:position"),
 }
 """In the order of the page."""
-STUDY = Study("development", CASES, (*OURS, *PEERS))
 
 
-def usual_methods(study: Study) -> tuple[str, ...]:
-    """The methods of a study that exist here."""
+def usual_methods() -> tuple[str, ...]:
+    """Our methods and the peers that exist here."""
     known = methods.every()
-    return tuple(name for name in study.methods if name in known)
+    return tuple(name for name in (*OURS, *PEERS) if name in known)
 
 
-def results(study: Study, run: StudyRun, names: Sequence[str]) -> Json:
+def results(run: StudyRun, names: Sequence[str], tested: Mapping[str, StudyCase] = CASES) -> Json:
     """The results of the methods `names`: `cases` with their sets, and entries by case and
     method.
 
@@ -82,14 +81,14 @@ def results(study: Study, run: StudyRun, names: Sequence[str]) -> Json:
     methods.find(names)
     cases: list[Json] = []
     found: list[Json] = []
-    for number, (name, case) in enumerate(study.cases.items(), 1):
+    for number, (name, case) in enumerate(tested.items(), 1):
         sweeps = case.load(run.data)
         if sweeps is None:
             run.left_out[name] = NO_DATA
             continue
         cases.append(_about(name, case, sweeps))
         plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort)
-        progress = f"{number}/{len(study.cases)} {name}"
+        progress = f"{number}/{len(tested)} {name}"
         found += _evaluated(name, sweeps, plan, run, progress)
     known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
     return {

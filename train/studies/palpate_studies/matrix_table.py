@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_studies import comparison, differences
+from palpate_studies import comparison, differences, markdown
 from palpate_studies.development_chart import PROTOCOLS
 from palpate_studies.method_names import plain_name
 from palpate_train.models.methods import SHIPPED
@@ -30,7 +30,7 @@ def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
         tests.setdefault(test, {}).setdefault(result["method"], []).append(
             [share, *result["interval"]]
         )
-    rows = [[cell.format(ours=plain_name(ours)) for cell in HEAD], ["---"] * len(HEAD)]
+    rows = []
     for removed, classes, protocol in sorted(tests, key=lambda test: (not test[0], -test[1])):
         found = {
             name: dict(zip(("mean", "low", "high"), np.mean(seeds, axis=0).tolist(), strict=True))
@@ -42,7 +42,7 @@ def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
             )
             what = f"{classes} classes: {PROTOCOLS.get(protocol, (protocol,))[0]}"
             rows.append([what, "removed" if removed else "kept", *_cells(line)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown.table([cell.format(ours=plain_name(ours)) for cell in HEAD], rows)
 
 
 def _cells(line: Json) -> list[str]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
-from palpate_studies.study import Study, StudyCase, StudyRun
+from palpate_studies.study import StudyCase, StudyRun
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Plan, Result, evaluate
 from palpate_train.metrics import score
@@ -133,9 +133,6 @@ class Outcome:
     def right(self) -> Array:
         """bool [n], whether the label is right."""
         return np.asarray(self.logits.argmax(1) == self.labels)
-
-
-STUDY = Study("paper", FULL, tuple(dict.fromkeys(m for step in FULL_STEPS for m in step.methods)))
 
 
 def results(how: StudyRun) -> Json:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from palpate_studies import development_chart
+from palpate_studies import development_chart, markdown
 from palpate_studies.method_names import plain_name
 from palpate_train.models.methods import PACKAGED, SHIPPED
 from palpate_train.reports.formatting import amount, estimate, percent
@@ -17,8 +17,7 @@ HEAD = ("question", "figure, 95 % interval", "test")
 
 
 def _table(rows: Iterable[Row]) -> str:
-    lines = [f"| {' | '.join(row)} |" for row in (HEAD, ("---",) * len(HEAD), *rows)]
-    return "\n".join(["", *lines, ""])
+    return f"\n{markdown.table(HEAD, rows)}\n"
 
 
 def recorded(results: Json) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from palpate_studies import markdown
 from palpate_train.reports.formatting import amount
 
 Json = Mapping[str, Any]
@@ -51,18 +52,15 @@ VIEWS = {
 def table(results: Json) -> str:
     """A row for each view: features, purpose, cost, condition, sets."""
     costs = {view["view"]: view for view in results["views"]}
-    rows = [
-        "| view | features | what it is for | alone: features, time, bytes | when chosen | on |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, (features, purpose, when) in VIEWS.items():
         cost = costs[name]
         spent = (
             f"{cost['features']}, {amount(cost['us'], 'µs')}, {amount(cost['bytes'] / 1e3, 'KB')}"
         )
-        on = _on(name, results["sets"])
-        rows.append(f"| {name} | {features} | {purpose} | {spent} | {when} | {on} |")
-    return "\n".join(rows)
+        rows.append([name, features, purpose, spent, when, _on(name, results["sets"])])
+    head = "view", "features", "what it is for", "alone: features, time, bytes", "when chosen", "on"
+    return markdown.table(head, rows)
 
 
 def _on(view: str, sets: Sequence[Json]) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from palpate_studies import markdown
+
 
 def table(results: Mapping[str, Any], pairs: bool = True) -> str:
     """A row for each rule that is left out, with `pairs` also for each pair of rules."""
@@ -13,14 +15,11 @@ def table(results: Mapping[str, Any], pairs: bool = True) -> str:
     kinds = list(first["total"])
     totals = ", ".join(f"{first['total'][kind]:,} {kind}" for kind in kinds)
     head = ["without", *(f"{kind}: right, wrong" for kind in kinds[:-1]), "junk with a label"]
-    lines = [f"Bundle {results['bundle']}, {totals}.", "", *_head([*head, "ms", "lines"])]
+    rows = []
     for row in (first, *others):
         name = " and ".join(row["without"]) or "(every rule)"
-        cells = [f"{row['right'][kind]}, {row['wrong'][kind]}" for kind in kinds[:-1]]
-        cells += [str(row["wrong"][kinds[-1]]), f"{row['ms']:.2f}", str(row["lines"] or "")]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(["", *lines, ""])
-
-
-def _head(names: list[str]) -> list[str]:
-    return [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+        counts = [f"{row['right'][kind]}, {row['wrong'][kind]}" for kind in kinds[:-1]]
+        cost = row["wrong"][kinds[-1]], f"{row['ms']:.2f}", row["lines"] or ""
+        rows.append([name, *counts, *cost])
+    about = f"Bundle {results['bundle']}, {totals}."
+    return f"\n{markdown.table([*head, 'ms', 'lines'], rows, about)}\n"

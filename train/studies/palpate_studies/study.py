@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,18 +56,6 @@ class StudyCase:
         loaders = [published if path.startswith(published.PREFIX) else sets for path in paths]
         loaded = [loader.load(path) for loader, path in zip(loaders, paths, strict=True)]
         return sets.join([one.select(self.only) for one in loaded])
-
-
-@dataclass(frozen=True, slots=True)
-class Study:
-    """An experiment with one file of results.
-
-    cases: by name, in the order of the page. methods: in the order in which they run.
-    """
-
-    name: str
-    cases: Mapping[str, StudyCase]
-    methods: tuple[str, ...]
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from palpate_studies import (
     bench_table,
     contact_table,
     development_report,
-    marked_text,
+    markdown,
     matrix_table,
     quantities,
     recipe_page,
@@ -28,10 +28,7 @@ README = "README.md"
 ALIGNMENT, FABRICS = "docs/alignment/README.md", "docs/fabricslide/README.md"
 SPECIFICATIONS, RECIPE = "docs/reference/specifications.md", "docs/recipe.md"
 FRONT = "docs/front.svg"
-HEAD = (
-    "| sweeps | classified correctly | wrong label | no label |",
-    "|---|---|---|---|",
-)
+HEAD = ("sweeps", "classified correctly", "wrong label", "no label")
 STRESSED = (
     ("noise", 0.0, "{:,} slides over trained materials"),
     ("dead", 1.0, "the same with one dead taxel, which is bridged"),
@@ -89,19 +86,17 @@ def junk(results: Any) -> str:
 
 def strangers(results: Any) -> str:
     """Where it takes an unknown material for a known one, from the same campaign."""
-    lines = ["| stranger | sweeps | label | with early answers |", "|---|---|---|---|"]
-    for kind, text in STRANGERS.items():
-        of = results["kinds"][kind]
-        lines.append(f"| {text} | {of['sweeps']} | {of['whole']} | {of['early']} |")
-    return "\n".join(["", *lines, ""])
+    kinds = [(text, results["kinds"][kind]) for kind, text in STRANGERS.items()]
+    rows = [[text, *(of[key] for key in ("sweeps", "whole", "early"))] for text, of in kinds]
+    return f"\n{markdown.table(('stranger', 'sweeps', 'label', 'with early answers'), rows)}\n"
 
 
 def _answers(rows: Iterable[tuple[str, int, int, int]]) -> str:
-    lines = [
-        f"| {text.format(total)} | {right:,} | {wrong:,} | {total - right - wrong:,} |"
+    cells = (
+        [text.format(total), *(f"{n:,}" for n in (right, wrong, total - right - wrong))]
         for text, total, right, wrong in rows
-    ]
-    return "\n".join(["", *HEAD, *lines, ""])
+    )
+    return f"\n{markdown.table(HEAD, cells)}\n"
 
 
 TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
@@ -130,7 +125,7 @@ def write(root: Path = Path()) -> list[str]:
     for document, marker, study, table in TABLES:
         text = texts.get(document) or (root / document).read_text(encoding="utf-8")
         made = table(read(results_file(study, root / DATA)))
-        texts[document] = marked_text.insert(text, marker, made, document)
+        texts[document] = markdown.insert(text, marker, made, document)
     for document, study in HEADED.items():
         about = provenance.of(read(results_file(study, root / DATA)))
         texts[document] = provenance.in_markdown(texts[document], about)

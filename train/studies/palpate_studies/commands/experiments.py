@@ -100,12 +100,11 @@ def run_recipe(args: argparse.Namespace) -> None:
 def run_development(args: argparse.Namespace) -> None:
     """Evaluate, time and write the results; with --times after timing alone."""
     run, keys = _run(args), PAGES["development"].keys
-    study = development_experiment.STUDY
-    names = options.names(args) if args.method else development_experiment.usual_methods(study)
+    names = options.names(args) if args.method else development_experiment.usual_methods()
     if args.times:
         figures = read(args.out, *keys)
     else:
-        figures = development_experiment.results(study, run, tuple(names))
+        figures = development_experiment.results(run, tuple(names))
     if args.times or not args.kept:
         train = development_times.TIMED.load()
         assert train is not None  # it is simulated

@@ -1,8 +1,17 @@
-"""Text of a command in a document, between two markers."""
+"""Tables in Markdown, and the text of a command in a document, between two markers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from palpate.core.errors import FormatError
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], about: str = "") -> str:
+    """A table with these cells, below a paragraph `about` it."""
+    lines = [f"| {' | '.join(map(str, cells))} |" for cells in (head, *rows)]
+    lines.insert(1, "|---" * len(head) + "|")
+    return "\n".join([about, "", *lines] if about else lines)
 
 
 def insert(document: str, name: str, text: str, path: str) -> str:
