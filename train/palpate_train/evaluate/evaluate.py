@@ -21,7 +21,7 @@ from palpate_train.data.splitters import Protocol, draw
 from palpate_train.evaluate import parallel
 from palpate_train.evaluate.fold import AsTheBox, Fold, FoldTask, key, run
 from palpate_train.metrics.answers import REFUSED, UNKNOWN, outcomes
-from palpate_train.metrics.score import Score, confusion, fuse, interval, provenance
+from palpate_train.metrics.score import confusion, fuse, interval, provenance, score_entry
 from palpate_train.models import methods as known_methods
 from palpate_train.models.methods import FULL_EFFORT, Effort
 from palpate_train.onnx_tools import parity
@@ -100,13 +100,13 @@ class Result:
         clusters = None if clusters is None else clusters[self.test]
         right = logits.argmax(1) == labels
         counts: dict[str, Any] = {
-            "window": Score.of(right).json(),
+            "window": score_entry(right),
             "interval": interval(right, clusters),
         }
         if "recording" in self.sweeps.groups:
             whole, first = fuse(logits, recording)
             right = whole.argmax(1) == labels[first]
-            counts["recording"] = Score.of(right).json()
+            counts["recording"] = score_entry(right)
             counts["recording_interval"] = interval(
                 right, None if clusters is None else clusters[first]
             )
@@ -128,7 +128,7 @@ class Result:
             clusters = Protocol(self.protocol).clusters(self.sweeps)
             became = outcomes(labels, sure, self.sweeps.labels[test])
             right = became.pop("right")
-            box |= Score.of(right).json() | {name: int(of.sum()) for name, of in became.items()}
+            box |= score_entry(right) | {name: int(of.sum()) for name, of in became.items()}
             box["interval"] = interval(right, None if clusters is None else clusters[test])
         return box
 

@@ -67,23 +67,10 @@ LIBRARIES = (
 """Distributions whose version may change the result of a fold."""
 
 
-@dataclass(frozen=True, eq=False)
-class BoxAnswers:
-    """The answers of the box to n sweeps. labels: int [n], or REFUSED or UNKNOWN of
-    palpate_train.metrics.answers. sure: bool [n], whether it is certain of the label."""
-
-    labels: Array
-    sure: Array
-
-    @classmethod
-    def of(cls, labels: Sequence[int], sure: Array) -> BoxAnswers:
-        """The answers with these labels."""
-        return cls(np.array(labels, int), np.asarray(sure, bool))
-
-
-AsTheBox = Callable[[methods.Model, Dataset], BoxAnswers | None]
-"""The box's answers to sweeps by a trained model; None if it is of a method that export does not
-pack."""
+AsTheBox = Callable[[methods.Model, Dataset], tuple[Array, Array] | None]
+"""The box's answers to n sweeps by a trained model: labels int [n], or REFUSED or UNKNOWN of
+palpate_train.metrics.answers, and bool [n], whether it is certain of them. None if the model is of
+a method that export does not pack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +95,7 @@ class Fold:
     or from the library if the method has no graph. ran: name of the trained model, if the method's
     name does not state it. cost: the training's cross entropy [iterations, 2], if it has one.
     forms: logits float32 [n, K] of the same sweeps by the same model in other precisions. box,
-    sure: the box's answers as in BoxAnswers, empty if there are none; not_packed: why export
+    sure: the box's answers as AsTheBox gives them, empty if there are none; not_packed: why export
     refuses the model. refused: why the method cannot work with this set; all else is empty then.
     """
 
@@ -195,7 +182,7 @@ def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: 
         box = task.as_the_box(model, sweeps.take(task.test))
     except (FormatError, BundleError) as e:
         return replace(fold, not_packed=str(e))
-    return replace(fold, box=box.labels, sure=box.sure) if box else fold
+    return replace(fold, box=box[0], sure=box[1]) if box else fold
 
 
 def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:

@@ -21,6 +21,7 @@ from palpate.core.errors import FormatError
 from palpate_train.answer.heads import fit_discriminant
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import InnerPart, Protocol, draw, inner_parts
+from palpate_train.evaluate.trivial import evenly, scaled
 from palpate_train.metrics.score import interval
 
 Array = NDArray[Any]
@@ -37,9 +38,6 @@ MOST_TAXELS = 255
 MOST_VALUES = 20
 """Largest number of values of a group within which discriminants are fitted."""
 FOLDS = 3
-DITHER = 1e-6
-"""Deviation of the noise that is added to levels whose deviation is 1. If all sweeps of a material
-had the same level, weights would be infinite without it."""
 UNTESTED = -1
 LEFT_OUT = "also where"
 """Words of the warning about a level that names materials across values; one such line suffices."""
@@ -75,8 +73,7 @@ def levels_of(sweeps: Dataset) -> Dataset:
     1 over all sweeps: samples float32 [n, 1, F, 1].
 
     Of more than MOST_SWEEPS sweeps about as many are drawn, of each material alike; of more than
-    MOST_TAXELS means as many, evenly. Taxels whose mean never changes are left out. Raises
-    FormatError if no taxel is left.
+    MOST_TAXELS means as many, evenly. Taxels whose mean never changes are left out.
     """
     drawn = np.arange(len(sweeps))
     if len(drawn) > MOST_SWEEPS:
@@ -85,12 +82,10 @@ def levels_of(sweeps: Dataset) -> Dataset:
     # sweep by sweep: a copy of all of them might not fit into memory
     means = np.stack([sweeps.samples[i].mean(axis=0, dtype=np.float64).ravel() for i in drawn])
     means = means[:, np.ptp(means, axis=0) > 0]
-    means = means[:, _evenly(means.shape[1], MOST_TAXELS)]
-    scaled = (means - means.mean(axis=0)) / means.std(axis=0)
-    scaled += DITHER * np.random.default_rng(0).standard_normal(scaled.shape)
+    levels = scaled(means[:, evenly(means.shape[1], MOST_TAXELS)])
     return replace(
         sweeps,
-        samples=scaled.astype(np.float32)[:, None, :, None],
+        samples=levels.astype(np.float32)[:, None, :, None],
         labels=sweeps.labels[drawn],
         groups={name: numbers[drawn] for name, numbers in sweeps.groups.items()},
         unloaded=None,
@@ -163,7 +158,7 @@ def _within(levels: Dataset, values: Array) -> tuple[Array, Array]:
     answers = np.full(len(levels), UNTESTED)
     possible = np.zeros((len(levels), len(levels.materials)), bool)
     present, recording = np.unique(values), levels.group("recording")
-    for value in present[_evenly(len(present), MOST_VALUES)]:
+    for value in present[evenly(len(present), MOST_VALUES)]:
         mine = np.flatnonzero(values == value)
         pairs = np.unique(np.stack([levels.labels[mine], recording[mine]]), axis=1)
         counts = np.bincount(pairs[0], minlength=len(levels.materials))
@@ -205,11 +200,6 @@ def _clusters(levels: Dataset, tested: Array) -> Array | None:
 def _between(low: float, high: float, share: float) -> float:
     """The number at this share of the way from `low` to `high`."""
     return low + share * (high - low)
-
-
-def _evenly(n: int, most: int) -> Array:
-    """Numbers below `n`, at most `most` of them, at equal distances."""
-    return np.linspace(0, n - 1, min(n, most)).round().astype(int)
 
 
 def _percent(share: float) -> str:

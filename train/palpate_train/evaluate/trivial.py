@@ -34,14 +34,14 @@ def features(sweeps: Dataset) -> dict[str, Array]:
     """The features [N, F] of each baseline by its name, with mean 0 and deviation 1."""
     n, frames = sweeps.samples.shape[:2]
     flat = sweeps.samples.reshape(n, frames, -1)
-    some = np.linspace(0, flat.shape[2] - 1, min(flat.shape[2], MOST_TAXELS)).round().astype(int)
+    some = evenly(flat.shape[2], MOST_TAXELS)
     means, spread = np.empty((n, len(some))), np.empty((n, len(some)))
     for i, sweep in enumerate(flat):  # a copy of all sweeps might not fit into memory
         means[i] = sweep[:, some].mean(axis=0, dtype=np.float64)
         spread[i] = sweep[:, some].std(axis=0, dtype=np.float64)
     logs = np.log(spread + 1e-3 * spread.mean() + np.finfo(float).tiny)
     bands = log_powers(sweeps.samples, some).reshape(n, -1)
-    return {MEANS: _scaled(means), BANDS: _scaled(np.hstack([logs, bands]))}
+    return {MEANS: scaled(means), BANDS: scaled(np.hstack([logs, bands]))}
 
 
 def right(x: Array, labels: Array, train: Array, test: Array) -> int:
@@ -99,9 +99,16 @@ def above(result: Json) -> str:
     )
 
 
-def _scaled(x: Array) -> Array:
+def scaled(x: Array) -> Array:
+    """Features [N, F] with mean 0 and deviation 1, without those that never change; a column of
+    zeros if none changes."""
     x = x[:, np.ptp(x, axis=0) > 0]
     if not x.shape[1]:
         return np.zeros((len(x), 1))
-    scaled: Array = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
-    return scaled + DITHER * np.random.default_rng(0).standard_normal(scaled.shape)
+    found: Array = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
+    return found + DITHER * np.random.default_rng(0).standard_normal(found.shape)
+
+
+def evenly(n: int, most: int) -> Array:
+    """Numbers below `n`, at most `most` of them, at equal distances."""
+    return np.linspace(0, n - 1, min(n, most)).round().astype(int)

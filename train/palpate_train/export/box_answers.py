@@ -5,22 +5,27 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate.fold import BoxAnswers
 from palpate_train.export.quantized_bundle import export
 from palpate_train.metrics import bundle_score
 from palpate_train.models.methods import Model
 from palpate_train.models.recipe.fitted import FittedModel, finished
 
+Array = NDArray[Any]
 
-def answers(model: Model, sweeps: Dataset) -> BoxAnswers | None:
-    """The answers to `sweeps`, as `export` and `score` give them; None for a model that is not a
-    fit. Raises FormatError or BundleError if export refuses the model."""
+
+def answers(model: Model, sweeps: Dataset) -> tuple[Array, Array] | None:
+    """The answers to `sweeps`, as `export` and `score` give them, see fold.AsTheBox; None for a
+    model that is not a fit. Raises FormatError or BundleError if export refuses the model."""
     if not isinstance(model, FittedModel):
         return None
     fit, own = model.fit, model.fit.train.materials
@@ -33,4 +38,4 @@ def answers(model: Model, sweeps: Dataset) -> BoxAnswers | None:
         classifier = Classifier(bundle.load(target), SystemClock())
         found, sure = bundle_score.labels_of(classifier, sweeps)
     labels = [sweeps.materials.index(own[k]) if k >= 0 else int(k) for k in found]
-    return BoxAnswers.of(labels, sure)
+    return np.array(labels, int), sure

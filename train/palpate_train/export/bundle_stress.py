@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
-from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate_train.data.corruptions import Corruption, applicable
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
@@ -75,19 +74,10 @@ def answers(
     """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
     five. lost: frames of each sweep that never arrived. alone: whether to ask the network alone,
     too."""
-    given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
-    labels = box.bundle.manifest.labels
-    for i, verdict in bundle_score.verdicts(box, sweeps, lost=lost):
-        truth = sweeps.materials[sweeps.labels[i]]
-        if verdict.status is Status.OK:
-            answer = "correct" if verdict.label == truth else "wrong"
-        else:
-            answer = (
-                str(verdict.status)
-                if verdict.status in (Status.UNSURE, Status.UNKNOWN)
-                else "refused"
-            )
-        given[answer][i] = True
-        if alone:
-            given["network"][i] = labels[int(box.logits(sweeps.samples[i]).argmax())] == truth
+    given = bundle_score.outcomes_of(box, sweeps, lost)
+    given["correct"] = given.pop("right")
+    if alone:
+        labels, truth = np.array(box.bundle.manifest.labels), np.array(sweeps.materials)
+        named = [int(box.logits(sweep).argmax()) for sweep in sweeps.samples]
+        given["network"] = labels[named] == truth[sweeps.labels]
     return given

@@ -18,8 +18,8 @@ from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate_train.data.sets import Dataset, digest
-from palpate_train.metrics.answers import REFUSED, UNKNOWN, Answers
-from palpate_train.metrics.score import Score, interval, provenance
+from palpate_train.metrics.answers import REFUSED, UNKNOWN, Answers, outcomes
+from palpate_train.metrics.score import interval, provenance, score_entry
 
 Array = NDArray[Any]
 CLUSTERS = ("position", "session", "object")
@@ -71,15 +71,24 @@ def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answer
     return Answers(labels, ok, np.where(decided, fused, UNKNOWN), logits.argmax(1))
 
 
+def outcomes_of(classifier: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
+    """The outcome of each sweep, as answers.outcomes. lost: frames of each that never arrived."""
+    known = classifier.bundle.manifest.labels
+    numbers = [known.index(m) if m in known else len(known) for m in sweeps.materials]
+    named, sure = labels_of(classifier, sweeps, lost=lost)
+    return outcomes(named, sure, np.array(numbers)[sweeps.labels])
+
+
 def labels_of(
-    classifier: Classifier, sweeps: Dataset, *, fused: bool = False
+    classifier: Classifier, sweeps: Dataset, *, fused: bool = False, lost: int = 0
 ) -> tuple[Array, Array]:
     """The box's labels, int64 [N] into those of the bundle, or REFUSED or UNKNOWN; and bool [N],
-    whether their status is ok. fused: each sweep gets the answer to its whole recording."""
+    whether their status is ok. fused: each sweep gets the answer to its whole recording. lost: as
+    for `verdicts`."""
     labels = classifier.bundle.manifest.labels
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
     answers, ok = np.full(len(sweeps), REFUSED), np.zeros(len(sweeps), bool)
-    for i, verdict in verdicts(classifier, sweeps, fused=fused):
+    for i, verdict in verdicts(classifier, sweeps, fused=fused, lost=lost):
         if verdict.label:
             answered = recording == recording[i] if fused else i
             answers[answered] = labels.index(verdict.label)
@@ -122,7 +131,7 @@ class BundleScore:
             "set": self.sweeps.source,
             "digest": digest(self.sweeps),
             "sweeps": len(self.sweeps),
-            "classified_correctly": Score.of(self.right).json()
+            "classified_correctly": score_entry(self.right)
             | {"interval": interval(self.right, self.clusters)},
             "interval_by": self.by,
             "statuses": self.statuses,
@@ -132,7 +141,7 @@ class BundleScore:
             "moved": self.displaced.total(),
         }
         if self.recordings is not None:
-            result["recordings"] = Score.of(self.recordings).json() | {
+            result["recordings"] = score_entry(self.recordings) | {
                 "interval": interval(self.recordings)
             }
         return result | provenance()

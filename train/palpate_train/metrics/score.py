@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import time
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -22,21 +21,9 @@ from palpate.core.statistics import wilson
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Score:
-    """`right` of `total` answers are right."""
-
-    right: int
-    total: int
-
-    @classmethod
-    def of(cls, right: Array) -> Score:
-        """The score of answers that are right or wrong, bool [n]."""
-        return cls(int(right.sum()), len(right))
-
-    def json(self) -> dict[str, int]:
-        """The entry of a result file, as scripts read it."""
-        return {"right": self.right, "total": self.total}
+def score_entry(right: Array) -> dict[str, int]:
+    """The entry of a result file for answers that are right or wrong, bool [n]."""
+    return {"right": int(right.sum()), "total": len(right)}
 
 
 def confusion(labels: Array, scores: Array) -> Array:

@@ -19,7 +19,6 @@ from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import quantized_bundle
 from palpate_train.metrics import bundle_score
-from palpate_train.metrics.answers import outcomes
 from palpate_train.models.methods import SkinUse
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
@@ -82,8 +81,7 @@ def answers(made: Fit, test: Dataset) -> Json:
         folder = Path(aside) / "bundle"
         quantized_bundle.export(made, folder, "loads", "1", commit(), proven=False)
         box = Classifier(bundle.load(folder), SystemClock(), slides=False)
-        labels, ok = bundle_score.labels_of(box, test)
-    became = outcomes(labels, ok, test.labels)
+        became = bundle_score.outcomes_of(box, test)
     network = run(quantized_bundle.graphs(made)[1], test.samples).argmax(axis=1) == test.labels
     return {"label": network, "right": became["right"], "wrong": became["wrong"]}
 
