@@ -26,9 +26,11 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     wide = replace(
         model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))
     )
-    names = [f"sim:{name}" for name in ("T-LAB/level-blind:3:2", "T-LAB/level-blind:1:1")]
+    names = ("T-LAB/level-blind:1:1", "T-LAB/level-blind:3:2", "T-HARD/level-blind:1:1")
+    given = dict(zip(alignment.SETS, (f"sim:{name}" for name in names), strict=True))
+    monkeypatch.setattr(alignment, "SETS", given)
     box = Classifier(wide, SystemClock())
-    figures = alignment.measure(box, *names, "sim:T-HARD/level-blind:1:1", lambda line: None)
+    figures = alignment.measure(box, lambda line: None)
     assert figures["other positions"]["moved"][0] == 0
     assert figures["T-HARD"]["moved"][0] == 1
     back, home, ahead = figures["moved"]["rows"]
@@ -52,4 +54,4 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
     without = replace(wide.manifest, contact=None, displacement=None)
     box = Classifier(replace(wide, manifest=without), SystemClock())
     with pytest.raises(FormatError, match="no positions"):
-        alignment.measure(box, "", "", "", print)
+        alignment.measure(box, print)

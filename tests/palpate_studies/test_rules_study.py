@@ -58,12 +58,15 @@ def test_the_table_has_each_row(few: dict[tuple[str, ...], dict]):
     assert rows[1:] == [" and ".join(names) for names in list(few)[1:]]
 
 
-def test_the_command_writes_its_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_writes_its_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
     """With slides of other places as displaced ones."""
     out = tmp_path / "rules.json"
     moved = "sim:T-HARD/level-blind:101:1"
-    given = "--set", SLIDES, "--moved", moved, "--each", "1"
-    assert main(["rules", *given, "--out", str(out)]) == 0
+    for name, value in {"STRESSED": SLIDES, "MOVED": moved, "EACH": 1}.items():
+        monkeypatch.setattr(f"palpate_studies.commands.measure.{name}", value)
+    assert main(["rules", "--out", str(out)]) == 0
     found = json.loads(out.read_bytes())
     assert found["sets"] == [SLIDES, moved]
     assert found["rows"][0]["total"]["displaced"] == 7

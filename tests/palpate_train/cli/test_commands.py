@@ -54,8 +54,6 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         ("--set sim:T-LAB:1:1 --seed -1", "number from 0"),
         ("--set sim:T-LAB:1:1 --stages -1", "--stages -1"),
         ("--set sim:T-LAB:1:1 --stages x", "--stages x"),
-        ("--set sim:T-LAB:1:1 --row-shift 3", "0 to 1"),
-        ("--set sim:T-LAB:1:1 --stretch -1", "--stretch -1"),
         ("--set sim:T-LAB:1:1 --out /proc/none/fit.npz", "cannot be written there"),
         ("--set sim:T-LAB:1:1 --out /", "--out / "),
         ("--set sim:T-LAB:1:1 --out f.csv", "f.csv"),

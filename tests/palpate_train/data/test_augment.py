@@ -93,8 +93,8 @@ def test_a_line_of_taxels_is_not_moved(rows: int):
     np.testing.assert_array_equal(varied(x, rows, shift=1.0, displaced=1.0), x)
 
 
-def test_gains_and_stretches_stay_within_the_asked():
-    """`gain` of all taxels, `gains` of each; 20 turns become 14 to 26."""
+def test_gains_spread_as_much_as_asked():
+    """`gain` of all taxels, `gains` of each."""
     x = sweeps(400, frames=20)
     for name, taxels in (("gain", 1), ("gains", 16)):
         ratio = varied(x, **{name: 0.3}) / x
@@ -104,12 +104,6 @@ def test_gains_and_stretches_stay_within_the_asked():
         assert log.std() == pytest.approx(0.3, rel=0.15)
         assert abs(log.mean()) < 0.05
         assert (log.std(axis=1).max() < 1e-3) == (taxels == 1)
-    turns = np.tile(np.sin(2 * np.pi * 20 * np.arange(600, dtype=np.float32) / 600), (60, 1, 1))
-    peaks = np.abs(np.fft.rfft(varied(turns, 1, stretch=0.3))).argmax(axis=2)
-    assert peaks.min() >= 13
-    assert peaks.max() <= 27
-    assert peaks.min() < 17
-    assert peaks.max() > 23
 
 
 def test_a_share_of_the_taxels_is_silent_or_noisy():
@@ -159,19 +153,12 @@ def test_noise_is_white_and_of_another_level_in_every_sweep():
     assert stats.kurtosis(loud, axis=None) == pytest.approx(0, abs=0.15)
 
 
-def test_drift_is_a_line_and_clipping_cuts_above():
-    """Ends have the wanted spread; values below the cut are unchanged."""
+def test_drift_is_a_line():
+    """Its ends have the wanted spread."""
     line = varied(np.zeros((100, 16, 301), np.float32), drift=0.5)
     assert line[..., -1].std() == pytest.approx(0.5, rel=0.1)
     assert np.abs(np.diff(line, n=2)).max() < 1e-5
     assert np.abs(line[..., 150]).max() < 1e-5
-    x = sweeps(200, frames=100)
-    now = varied(x, clipped=0.3)
-    cut = (now != x).any(axis=2)
-    assert 0.24 < cut.mean() < 0.33  # a cut above the highest value shows nothing
-    top = now.max(axis=2, keepdims=True)
-    np.testing.assert_array_equal(now, np.minimum(x, top))
-    assert (top[cut] < x.max(axis=2, keepdims=True)[cut]).all()
 
 
 def test_hum_is_one_sine_on_all_taxels():
@@ -206,9 +193,9 @@ def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames
 
 def test_copies_that_judge_are_moved_and_nothing_else():
     """Position, contact and gains of the skin change; noise and failures of the sensor are off."""
-    usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3, clipped=0.4)
+    usual = Augmentation(noisy=0.1, drift=0.2, hum=0.3)
     judging = usual.without_faults()
-    for name in ("noise", "noisy", "silent", "drift", "hum", "clipped"):
+    for name in ("noise", "noisy", "silent", "drift", "hum"):
         assert getattr(judging, name) == 0
     for name in ("shift", "damped", "gains"):
         assert getattr(judging, name) == getattr(usual, name)

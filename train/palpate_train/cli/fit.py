@@ -114,19 +114,6 @@ def _add_use(command: argparse.ArgumentParser) -> None:
             f"features ignore its hum (default {SkinUse().mains_hz:g})"
         ),
     )
-    command.add_argument(
-        "--row-shift",
-        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
-        metavar="SHARE",
-        dest="displaced",
-        help="share of training sweeps with a displacement of up to a row (default 0.5)",
-    )
-    command.add_argument(
-        "--stretch",
-        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
-        metavar="SHARE",
-        help="change the speed of training sweeps by up to this share (default 0)",
-    )
 
 
 def _add_dial(command: argparse.ArgumentParser) -> None:
@@ -271,7 +258,7 @@ def _check(args: argparse.Namespace) -> None:
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path | None]:
     """The fit for these options, the reduction of its sweeps, and the folder that keeps the
     training of stages until the fit is written."""
-    use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
+    use = SkinUse(args.reattached, float(args.mains))
     log, unfinished = options.Log(), _unfinished(args, sweeps, use) if args.steps else None
     run = Run(args.seed, log, unfinished)
     settings = recipe.Settings(

@@ -1,5 +1,5 @@
-"""Augmentation: the sweeps that a skin might have given if it had been attached anew, slid at
-another speed, or read by a worse amplifier.
+"""Augmentation: the sweeps that a skin might have given if it had been attached anew, or read by a
+worse amplifier.
 
 `augment` changes prepared sweeps in the training of a network. `copies` gives raw counts, from
 which heads in closed form learn how materials vary. Every change is drawn anew for every sweep from
@@ -60,8 +60,6 @@ class Augmentation:
     """Spread of the logarithm of each taxel's own gain."""
     silent: float = 0.05
     """Share of the taxels without a signal: dead, stuck or saturated."""
-    stretch: float = 0.0
-    """Largest change of speed, as a share of the speed, below 1."""
     damped: float = 0.5
     """Share of the sweeps in which skin and tape absorb high frequencies: a first-order low-pass
     with its cut-off anywhere in the OCTAVES below half the sampling rate."""
@@ -77,9 +75,6 @@ class Augmentation:
     at the start."""
     hum: float = 0.0
     """Largest amplitude of a sine of any frequency, the same on all taxels."""
-    clipped: float = 0.0
-    """Share of the taxels that are clipped from above, anywhere within two of their own deviations
-    of their mean."""
 
     def without_faults(self) -> Augmentation:
         """The effects of another position of the skin alone, without those of its electronics.
@@ -87,7 +82,7 @@ class Augmentation:
         Noise and silent taxels make copies so much harder to name than any displaced skin is that
         an error rate of such copies says nothing about it.
         """
-        return replace(self, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0, clipped=0.0)
+        return replace(self, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0)
 
 
 SLOW = Augmentation(gain=0.4, noise=0.1, silent=0.0, damped=0.0, colour=0.0)
@@ -109,9 +104,7 @@ def augment(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> 
     `Network.prepare`); it is not changed.
     """
     x = _attached(x, rows, augmentation, rng)  # new memory, which may be written to
-    for change in (_stretched, _filtered, _with_faults, _clipped):
-        x = change(x, augmentation, rng)
-    return x
+    return _with_faults(_filtered(x, augmentation, rng), augmentation, rng)
 
 
 def _attached(x: Array, rows: int, augmentation: Augmentation, rng: Generator) -> Array:
@@ -145,20 +138,6 @@ def _shifted(x: Array, rows: int, augmentation: Augmentation, rng: Generator) ->
     near = np.maximum(1 - np.abs(source.clip(0, rows - 1)[..., None] - row), 0)
     shifted: Array = np.matmul(near * level[..., None], x.reshape(n, rows, -1)).reshape(x.shape)
     return shifted
-
-
-def _stretched(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """Change the speed; a sweep that ends too soon is continued backwards."""
-    n, _, frames = x.shape
-    if not augmentation.stretch or frames < 2:
-        return x
-    last, time = frames - 1, np.arange(frames, dtype=np.float32)
-    at = last - np.abs(last - time * (1 + augmentation.stretch * _symmetric(rng, n, 1)))
-    left = np.floor(at).clip(0, last - 1)
-    take = left.astype(np.int64)[:, None]
-    return _lerp(
-        np.take_along_axis(x, take, 2), np.take_along_axis(x, take + 1, 2), (at - left)[:, None]
-    )
 
 
 def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
@@ -208,15 +187,6 @@ def _with_faults(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
             2 * pi * (frequency / 2 * np.arange(frames, dtype=np.float32) + phase)
         )
     return x
-
-
-def _clipped(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
-    """Clip as a converter or a skin does at the end of its range."""
-    if not augmentation.clipped:
-        return x
-    n, taxels, _ = x.shape
-    top = x.mean(2, keepdims=True) + 2 * x.std(2, keepdims=True) * _symmetric(rng, n, taxels, 1)
-    return np.where(_chosen(augmentation.clipped, rng, n, taxels, 1), np.minimum(x, top), x)
 
 
 def _white_noise(rng: Generator, n: int, taxels: int, frames: int) -> Array:

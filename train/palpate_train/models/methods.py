@@ -49,19 +49,10 @@ class SkinUse:
 
     reattached: the skin will be taken off and put back after the recordings; all heads then see
     augmented copies. mains_hz: frequency of the mains, to whose hum features do not respond.
-    displaced, stretch: of data.augment.Augmentation; None for its default.
     """
 
     reattached: bool = False
     mains_hz: float = 50.0
-    displaced: float | None = None
-    stretch: float | None = None
-
-    @property
-    def augmentation(self) -> dict[str, float]:
-        """The values that replace those of the default Augmentation, by name."""
-        stated = {"displaced": self.displaced, "stretch": self.stretch}
-        return {name: value for name, value in stated.items() if value is not None}
 
 
 AS_RECORDED = SkinUse()

@@ -26,6 +26,12 @@ from palpate_train.metrics.score import interval, provenance
 
 Array = NDArray[Any]
 Json = dict[str, Any]
+UNSEEN = "other positions"
+SETS = {
+    "trained positions, other sweeps": "sim:T-REAL/level-blind:1-6:2",
+    UNSEEN: "sim:T-REAL/level-blind:101-104:2",
+    "T-HARD": "sim:T-HARD/level-blind:101-136:2",
+}
 OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
 """Displacements of the skin in mm."""
 DIRECTIONS = {"rows": "dx_mm", "columns": "dy_mm"}
@@ -33,9 +39,8 @@ LOSS = 0.05
 """Accuracy counts as lost if it is this far below that of a skin that was not moved."""
 
 
-def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:
-    """The box's answers to simulated sweeps: at positions that were not trained (`unseen`, whose
-    skin is then moved), at trained positions (`seen`), and at those of T-HARD (`hard`).
+def measure(box: Classifier, log: Callable[[str], None]) -> Json:
+    """The box's answers to the simulated sweeps of SETS, and with the skin moved from UNSEEN.
 
     Raises FormatError if the bundle has no positions.
     """
@@ -51,13 +56,9 @@ def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[s
     }
     result |= {
         name: _point(box, EvaluationSweeps.simulated(spec)) | {"set": spec}
-        for name, spec in (
-            ("trained positions, other sweeps", seen),
-            ("other positions", unseen),
-            ("T-HARD", hard),
-        )
+        for name, spec in SETS.items()
     }
-    test, result["moved"] = EvaluationSweeps.simulated(unseen), {}
+    test, result["moved"] = EvaluationSweeps.simulated(SETS[UNSEEN]), {}
     for direction, name in DIRECTIONS.items():
         points = []
         for mm in (*(-off for off in reversed(OFF_MM)), 0.0, *OFF_MM):

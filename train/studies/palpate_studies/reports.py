@@ -94,7 +94,7 @@ REPORTS = (
         folds=True,
     ),
     _study("stress"),
-    _study("rules", "--moved", "sim:T-HARD/level-blind:101-112:2", folds=False),
+    _study("rules", folds=False),
     _study("paper"),
     ResultFile("overview", "overview.svg", ("palpate_studies", "overview")),
     ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),

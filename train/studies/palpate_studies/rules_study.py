@@ -43,16 +43,15 @@ MODULES = {
 
 
 def results(
-    bundle: Bundle, tested: Dataset, moved: Dataset | None, each: int, log: Callable[[str], None]
+    bundle: Bundle, tested: Dataset, moved: Dataset, each: int, log: Callable[[str], None]
 ) -> Json:
     """The answers with all rules, and without each; see `rows`. moved: slides at other places, each
     of which counts as displaced."""
     given = list(trial.sweeps_for(tested, bundle, 1, each))
-    if moved is not None:
-        given.append(trial.Given(moved, trial.DISPLACED))
+    given.append(trial.Given(moved, trial.DISPLACED))
     return {
         "bundle": bundle.id,
-        "sets": [one.source for one in (tested, moved) if one],
+        "sets": [tested.source, moved.source],
         "seeds": [1],
         "rows": list(rows(bundle, given, log)),
     } | provenance()

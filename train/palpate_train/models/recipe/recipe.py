@@ -143,8 +143,8 @@ class Setup:
         """Raises FormatError if the window is too short."""
         groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
         sweeps = thinned(replace(sweeps, groups=groups), settings.most)
-        usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
-        return cls(sweeps, run, settings, replace(usual, **settings.use.augmentation))
+        augmentation = default_augmentation(FIXED.zero_sum(sweeps.format.window))
+        return cls(sweeps, run, settings, augmentation)
 
     @cached_property
     def copies(self) -> list[Dataset]:

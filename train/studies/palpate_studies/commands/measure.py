@@ -41,6 +41,9 @@ from palpate_train.models.recipe import recipe
 
 STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+MOVED, EACH = "sim:T-HARD/level-blind:101-112:2", 48
+"""Slides at places that are displaced, and the number of sweeps of each alteration and each kind of
+junk, for the study `rules`."""
 OWN = "stressed"
 """Name of a bundle that the study makes for itself."""
 STRESSED_METHODS = (
@@ -53,55 +56,14 @@ def register(add: Add) -> None:
     """Add all commands of this module."""
     _add_stress(add)
     _add_certainty(add)
-    _add_alignment(add)
-    _add_rules(add)
-
-
-def _add_alignment(add: Add) -> None:
-    command = add("alignment", run_alignment)
-    command.add_argument(
-        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
-    )
-    command.add_argument(
-        "--seen",
-        default="sim:T-REAL/level-blind:1-6:2",
-        metavar="SET",
-        help="what it was trained on",
-    )
-    command.add_argument(
-        "--unseen",
-        default="sim:T-REAL/level-blind:101-104:2",
-        metavar="SET",
-        help="moved from these places",
-    )
-    command.add_argument(
-        "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
-    )
-    add_out(command, "alignment", kept=False)
-
-
-def _add_rules(add: Add) -> None:
-    command = add("rules", run_rules)
-    command.add_argument(
-        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
-    )
-    command.add_argument("--set", default=STRESSED, metavar="SET", help=f"({STRESSED})")
-    command.add_argument("--moved", metavar="SET", help="slides at places that are displaced")
-    command.add_argument(
-        "--each",
-        type=numbers.whole("--each", 1),
-        default=48,
-        metavar="N",
-        help="sweeps of each alteration and each kind of junk (48)",
-    )
-    add_out(command, "rules", kept=False)
+    add_out(add("alignment", run_alignment), "alignment", kept=False)
+    add_out(add("rules", run_rules), "rules", kept=False)
 
 
 def run_rules(args: argparse.Namespace) -> None:
     """Measure, write the results, and print their table."""
-    moved = sets.load(args.moved) if args.moved else None
-    tested, log = sets.load(args.set), options.Log()
-    result = rules_study.results(bundle.load(args.bundle), tested, moved, args.each, log)
+    tested, moved, packaged = sets.load(STRESSED), sets.load(MOVED), bundle.load(bundle.DEFAULT)
+    result = rules_study.results(packaged, tested, moved, EACH, options.Log())
     save(args.out, result)
     print(rules_table.table(result))
 
@@ -119,13 +81,6 @@ def _add_stress(add: Add) -> None:
     )
     command.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
-    )
-    command.add_argument(
-        "--bundle",
-        type=Path,
-        metavar="DIR",
-        help="that answers as the box does (the packaged one; with --split that of `fit` and "
-        "`export` at their defaults)",
     )
     add_out(command, "stress")
     options.add_effort(command)
@@ -183,7 +138,7 @@ def run_stress(args: argparse.Namespace) -> None:
     else:
         test = EvaluationSweeps.of(sets.load(args.test).select(args.only))
     with tempfile.TemporaryDirectory() as own:
-        folder = _made_of(train, Path(own), log) if args.split and not args.bundle else args.bundle
+        folder = _made_of(train, Path(own), log) if args.split else None
         box = _box_under_stress(folder, test, seeds, log)
     result = stress.run(
         names,
@@ -261,9 +216,9 @@ def run_certainty(args: argparse.Namespace) -> None:
 
 def run_alignment(args: argparse.Namespace) -> None:
     """Measure, write the results, and print their table."""
-    box = Classifier(bundle.load(args.bundle), SystemClock())
+    box = Classifier(bundle.load(bundle.DEFAULT), SystemClock())
     displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
     progress = Progress(displacements, options.Log())
-    result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
+    result = alignment.measure(box, progress.begin)
     save(args.out, result)
     print(contact_table.table(result))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from palpate.core import outputs
 from palpate.core.storage import put
 from palpate_studies import overview_plot, pages, reports, tables
 from palpate_studies.study import DATA
@@ -13,6 +12,8 @@ from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
 from palpate_train.metrics import score
 from palpate_train.reports import provenance
+
+OVERVIEW = Path("docs/overview.svg")
 
 
 def register(add: Add) -> None:
@@ -38,15 +39,7 @@ def register(add: Add) -> None:
         help=f"folder of the files of results ({DATA})",
     )
     add("tables", run_tables)
-    overview = add("overview", run_overview)
-    overview.add_argument(
-        "--out",
-        type=outputs.file(".svg"),
-        default=Path("docs/overview.svg"),
-        metavar="FILE.svg",
-        help="(docs/overview.svg)",
-    )
-    overview.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
+    add("overview", run_overview)
 
 
 def run_reports(args: argparse.Namespace) -> None:
@@ -78,12 +71,11 @@ def run_tables(args: argparse.Namespace) -> None:
 
 
 def run_overview(args: argparse.Namespace) -> None:
-    """Write the plot and print its path."""
+    """Write the plot and print its path. Raises FormatError outside of the project's folder."""
+    reports.require_project()
     about = provenance.of(
         score.provenance()
         | {"set": f"sim:T-REAL/level-blind:{overview_plot.SEED}", "seed": overview_plot.SEED}
     )
-    put(
-        args.out, provenance.in_svg(overview_plot.draw(args.material), about).encode(), parents=True
-    )
-    print(args.out)
+    put(OVERVIEW, provenance.in_svg(overview_plot.draw("wood"), about).encode())
+    print(OVERVIEW)
