@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from math import isclose
 from typing import Any
 
 import numpy as np
@@ -69,15 +70,15 @@ def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array
         np.zeros((folds, len(kinds))),
         np.empty(len(values), int),
     )
+    into = np.eye(folds)[:, :, None]
     for group in order:
         best, least, size = 0, np.inf, np.inf
-        for k in range(folds):
-            tried = held.copy()
-            tried[k] += counts[group]
-            unequal = float((tried / totals).std(axis=0).mean())
-            smaller = np.isclose(unequal, least) and held[k].sum() < size
+        tried = held + into * counts[group]  # [fold of the group, folds, K]
+        sizes = held.sum(axis=1).tolist()
+        for k, unequal in enumerate((tried / totals).std(axis=1).mean(axis=1).tolist()):
+            smaller = isclose(unequal, least, rel_tol=1e-5, abs_tol=1e-8) and sizes[k] < size
             if unequal < least or smaller:
-                best, least, size = k, unequal, held[k].sum()
+                best, least, size = k, unequal, sizes[k]
         held[best] += counts[group]
         fold[group] = best
     dealt: Array = fold[member]

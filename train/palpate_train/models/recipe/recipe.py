@@ -122,6 +122,11 @@ class Trunk:
         )
         return run(model, sweeps.samples)
 
+    @property
+    def quantized(self) -> bool:
+        """Whether its features in int8 differ from those in float: stages, and what sees bytes."""
+        return bool(self.architecture.channels) or self.sweeps.format.dtype == "uint8"
+
     def layout(self) -> dict[str, slice]:
         """See graph.layout."""
         return graph.layout(self.sweeps.format, self.weights, self.architecture)
@@ -396,7 +401,9 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
     trunk, plan = pruned(fixed.trunk, stages, chosen)
     known = setup.stages[1].beside(fixed.data) if stages else fixed.data
     columns = chosen.columns()
-    for name, data in (("head", setup.data(trunk, False)), ("int8", known.seen(columns))):
+    seen = known.seen(columns)
+    in_float = setup.data(trunk, False) if trunk.quantized else seen
+    for name, data in (("head", in_float), ("int8", seen)):
         weight, bias = plan.fit(data, classes)
         heads[f"{name}.weight"] = weight - weight.mean(axis=0)
         heads[f"{name}.bias"] = bias - bias.mean()
