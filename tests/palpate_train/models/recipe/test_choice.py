@@ -497,14 +497,16 @@ def test_one_part_may_show_what_carries_over(won: list[int], saved: float, carri
     assert not found.better
 
 
-def test_shares_and_few_scales_take_the_place_of_magnitudes_that_mislead():
-    """Magnitudes name the material in one group alone, shares and relations in each."""
+@pytest.mark.parametrize("relations", [[[5, 6], [7, 8]], [[]]], ids=["skin", "one taxel"])
+def test_shares_and_few_scales_take_the_place_of_magnitudes_that_mislead(relations: list):
+    """Magnitudes name the material in one group alone, shares and relations in each. A single
+    taxel has no relations."""
     given, parts = known(600)
     rng, own = np.random.default_rng(5), given.features[:, GOOD]
     views = [own + 2.5 * rng.standard_normal((600, 2)) for _ in range(4)]
     x = np.hstack([given.features[:, TRAP], *views]).astype(np.float32)
     at = HeldOutScores([replace(given, features=x, of_copies=lambda: x)] * 3, parts, 3)
-    offered = candidates([[0]], [0], [1], levels=(3, 4), relations=[[5, 6], [7, 8]])
+    offered = candidates([[0]], [0], [1], levels=(3, 4), relations=relations)
     chosen = choice.choose(at, offered, print)
     assert 0 not in chosen.plan.columns()
-    assert {1, 3, 5} <= set(chosen.plan.columns().tolist())
+    assert {1, 3, *relations[0][:1]} <= set(chosen.plan.columns().tolist())

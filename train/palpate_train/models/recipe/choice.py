@@ -376,16 +376,24 @@ class Candidates:
 
     def steady(self, best: Heads) -> dict[str, Heads]:
         """Shares, distribution, and one and few scales of the relations, a discriminant each: they
-        carry over to a new speed, and magnitudes in the same sum would outvote them."""
+        carry over to a new speed, and magnitudes in the same sum would outvote them. A single
+        taxel has no relations."""
         of = self.columns
-        if not (of.relations.size and len(of.shares) and len(of.levels)):
+        if not (len(of.shares) and len(of.levels)):
             return {}
-        views = (of.shares, 1.0), (of.levels, 1.0), (of.relations[:1], 1.0)
-        heads = [
-            HeadPart(tuple(view.ravel().tolist()), best[0].copies, weight=weight)
-            for view, weight in (*views, (of.relations[: relations.SHORT], float(len(views) - 1)))
-        ]
-        return {"without magnitudes, with few scales": tuple(heads)}
+
+        def apart(*views: tuple[Array, float]) -> Heads:
+            return tuple(
+                HeadPart(tuple(view.ravel().tolist()), best[0].copies, weight=weight)
+                for view, weight in views
+            )
+
+        views = (of.shares, 1.0), (of.levels, 1.0)
+        if not of.relations.size:
+            both = apart(*views)
+            return {"without magnitudes": both, "with shares and distribution": (*best, *both)}
+        few = (of.relations[:1], 1.0), (of.relations[: relations.SHORT], float(len(views)))
+        return {"without magnitudes, with few scales": apart(*views, *few)}
 
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
