@@ -26,7 +26,7 @@ TEMPERATURES = np.geomspace(1, 100, 200)
 """Candidates of `platt_temperature` and `sufficient_temperature`. Posteriors of LDA (temperature 1)
 are never underconfident; at 100 they are almost uniform."""
 STEP, PRECISION = 0.5, 1e-5
-COARSE = np.arange(-6, 4 + STEP, STEP)
+COARSE: list[float] = np.arange(-6, 4 + STEP, STEP).tolist()
 """Logarithms of temperatures that `weighted_platt_temperature` compares first, because very sure
 logits have several minima, and the precision of the result."""
 SLACK = 0.5
