@@ -128,6 +128,7 @@ class SerialSensor(LinkSensor):
         self._open_port = open_port or (
             lambda path, baud: SerialLink(path, baud, clock, collect_ns=collect_ns(profile))
         )
+        self._on_usb = False  # the port is of USB itself, which has no speed
         self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
 
     def _proven(self, now_ns: int) -> bool:
@@ -138,6 +139,7 @@ class SerialSensor(LinkSensor):
         there = self._ports()
         path = self._config.port or find(self._profile.ids, self._config.serial, there)
         node = os.path.realpath(path)  # a path in /dev/serial/by-id is a link
+        self._on_usb = os.path.basename(node).startswith("ttyACM")
         info = next((port for port in there if port.path in (path, node)), PortInfo(path))
         port = self._open_port(path, self._profile.baud)
         try:
@@ -166,8 +168,9 @@ class SerialSensor(LinkSensor):
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         if not bytes_came:
             return super()._no_frame(bytes_came=False)
+        baud = "" if self._on_usb else " or the profile's baud"
         remedy = self._stream.misfit or (
-            "correct skin.profile, skin.grid or the profile's baud (`palpate skin detect` listens);"
+            f"correct skin.profile, skin.grid{baud} (`palpate skin detect` listens);"
             " a board that boots when it is opened needs a longer skin.silence_ms"
         )
         return SensorMismatch(

@@ -352,6 +352,16 @@ def test_a_port_by_id_has_a_serial_number_and_a_misfit_its_value(tmp_path):
     assert re.search(r"-\d+, which uint16 ", str(skin.sensor.trouble))
 
 
+@pytest.mark.parametrize("port", ["ttyUSB0", "ttyACM0"])
+def test_the_speed_is_blamed_only_where_it_matters(port, tmp_path):
+    """A board on USB itself has no speed; behind an adapter it may be wrong."""
+    skin = WiredSkin("matrix", port=str(tmp_path / port))
+    skin.port.mangle = lambda data: b"\x55" * len(data)
+    skin.seconds(6)
+    assert skin.sensor.state == "mismatch"
+    assert ("baud" in str(skin.sensor.trouble)) == (port == "ttyUSB0")
+
+
 @pytest.mark.parametrize("name", ["flexitac", "reskin"])
 def test_a_board_that_boots_whenever_it_is_opened(name):
     """The box waits longer each time; the message names the setting."""

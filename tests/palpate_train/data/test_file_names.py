@@ -21,6 +21,7 @@ from palpate_train.data.file_names import NamePattern, group
             {"material": "plastic_rough", "force": "5"},
         ),
         ("{material}_{x:f}.csv", "wood_-0.5.csv", {"material": "wood", "x": "-0.5"}),
+        ("./a\\{material}.csv", "a/wood.csv", {"material": "wood"}),
         ("{material}.(1).csv", "a+b.(1).csv", {"material": "a+b"}),
         ("{material}.csv", "wood.txt", None),
         ("{material}.csv", "deep/wood.csv", None),
@@ -42,6 +43,7 @@ def test_a_name_that_fits_in_several_ways_is_refused():
     ("pattern", "message"),
     [
         ("{trial}.csv", "where"),
+        ("*/{material}.csv", "for any text"),
         ("{material}_{a}_{a}.csv", "'a' stands twice"),
         ("{material}_{A}.csv", "'A'"),
         ("{material}_{a.csv", "brace"),

@@ -211,6 +211,11 @@ def test_times_may_have_their_unit_behind_each(form: str):
         "31. Januar 2026 12:59:{0:06.3f}",
         "2026-01-31, 12:59:{0:06.3f} UTC",
         "2026-01-31_12:59:{0:06.3f}",
+        "2026-01-31 12:59:{0:06.3f}+01",
+        "2026-01-31 12:59:{0:06.3f} CET",
+        "2026-01-31T12:59:{0:06.3f}+01:00[Europe/Berlin]",
+        "12:59:{0:06.3f} p.m.",
+        "1.02:59:{0:010.7f}",
         "20260131T1259{0:06.3f}Z",
         "20260131_1259{1:02d}_{2:03d}",
         "59:{0:06.3f}",
@@ -224,6 +229,40 @@ def test_dates_of_other_forms_give_the_times(form: str):
     table = text(("when", "a"), texts={0: dates})
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
     np.testing.assert_allclose(time_s, np.arange(40) / 4)
+
+
+def test_clocks_without_zeros_and_zones_that_change():
+    """3:5:9.5 as sketches write it; CET after CEST does not say how the hours go on."""
+    times = [f"3:{5 + k // 60}:{k % 60}.5" for k in range(40, 80)]
+    asked = plan(grid="1x1", time="when:date", rate_hz=None)
+    _, time_s, _ = frames.frames(text(("when", "a"), texts={0: times}), asked)
+    np.testing.assert_allclose(time_s, np.arange(40))
+    zones = [f"02:59:{k:02} {'CEST' if k < 20 else 'CET'}" for k in range(40)]
+    with pytest.raises(FormatError, match="CEST and CET"):
+        frames.frames(text(("when", "a"), texts={0: zones}), asked)
+
+
+@pytest.mark.parametrize("columns", ["", "s*"])
+def test_names_in_the_order_of_letters_go_by_their_numbers(columns: str):
+    """s0, s1, s10, s11, s2: programs sort names so, and HDF5 its members. Another order stays."""
+    values = cube(3, 4, 40).reshape(40, 12)
+    names = [f"s{i}" for i in range(12)]
+    order = sorted(range(12), key=lambda i: names[i])
+    asked = plan(grid="3x4", columns=columns)
+    table = Table(values[:, order], tuple(names[i] for i in order))
+    np.testing.assert_array_equal(frames.frames(table, asked)[0], values.reshape(40, 3, 4))
+    table = Table(values, tuple(names[::-1]))
+    np.testing.assert_array_equal(frames.frames(table, asked)[0], values.reshape(40, 3, 4))
+
+
+def test_a_row_for_each_taxel_may_begin_with_its_name():
+    """The names are those of the columns then; a time may be among them."""
+    rows = np.vstack([np.arange(40) / 10, cube(2, 2, 40).reshape(40, 4).T])
+    table = Table(np.hstack([np.full((5, 1), np.nan), rows]), texts={0: ["t", *"abcd"]})
+    asked = plan(grid="2x2", time="t:s", rate_hz=None, transpose=True)
+    found, time_s, _ = frames.frames(table, asked)
+    np.testing.assert_array_equal(found, cube(2, 2, 40))
+    np.testing.assert_allclose(time_s, np.arange(40) / 10)
 
 
 @pytest.mark.parametrize(
@@ -301,6 +340,21 @@ def test_a_taxel_with_other_times_is_refused(late: float, refused: bool):
             frames.frames(table, asked)
     else:
         np.testing.assert_array_equal(frames.frames(table, asked)[0][:, 0], values[:, [1, 3]])
+
+
+def test_texts_for_each_frame_and_packed_counts_of_hdf5(tmp_path: Path):
+    """An array of texts, an attribute of one text; counts that xarray packed."""
+    x = cube(2, 2, 40)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["skin"] = x
+        file["skin"].attrs.update({"scale_factor": 0.5, "add_offset": [3.0], "_FillValue": [8]})
+        file["label"] = [b"wood"] * 20 + [b"felt"] * 20
+        file.attrs["who"] = ["Ada"]
+    table = raw_files.read(tmp_path / "a.h5", ReadPlan(fields=("label", "who")))
+    np.testing.assert_array_equal(table.values, np.where(x == 8, np.nan, x * 0.5 + 3))
+    parts = frames.fields(table, {"material": "label", "session": "who"}, 40)
+    assert [part.start for part, _ in parts] == [0, 20]
+    assert parts[1][1] == {"material": "felt", "session": "Ada"}
 
 
 def test_facts_about_a_recording_are_fields(tmp_path: Path):

@@ -37,13 +37,16 @@ class NamePattern:
     option: str = "--pattern"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "text", normal(self.text))
+        text = normal(self.text).replace("\\", "/").removeprefix("./").lstrip("/")
+        object.__setattr__(self, "text", text)
         names = self.names
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
                 f"{self.option} {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
+        if "*" in rest:
+            raise FormatError(f"{self.option} {self.text!r} has a *; write {{}} for any text")
         if "material" not in (*names, *self.elsewhere):
             raise FormatError(
                 f"{self.option} {self.text!r} does not say where the material stands; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -27,9 +28,10 @@ _NAMED = r"\d{1,2}\.?[- ][^\W\d_]{3,9}\.?[- ]\d{2,4}|[A-Za-z]{3,9} \d{1,2}(?:,? 
 MOMENT = re.compile(
     r"(?:(?:[A-Z][a-z]{1,8},? )?"
     rf"(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ,_-]+)?"
-    r"(?:(?P<since>\d+) days?,? )?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
-    r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3}(?:\d{3})?)?))?\s?(?P<noon>[aApP][mM])?"
-    r"\s?(?P<zone>Z|UTC|GMT|[+-]\d\d:?\d\d)?(?P<year> \d{4})?"
+    r"(?:(?P<since>\d+)(?: days?,? |\.(?=\d\d:)))?(?P<hour>\d{1,2}):(?P<minute>\d{1,2})"
+    r"(?::(?P<second>\d{1,2}(?:[.,]\d+|:\d{3}(?:\d{3})?)?))?\s?(?P<noon>[aApP]\.?[mM]\.?)?"
+    r"\s?(?P<zone>Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s?(?P<place>[A-Z]{3,5}|\[[\w/]+\])?"
+    r"(?P<year> \d{4})?"
 )
 """A time of the day, perhaps with its date and zone; the year may stand at the end. Or a time since
 the beginning, with its days."""
@@ -67,6 +69,8 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
     Raises FormatError that names the option which decides, or the first reading that is not a
     number.
     """
+    if plan.order == ("taxel", "frame") and table.values.ndim == 2:
+        table, plan = _turned(table), replace(plan, axes="frame,taxel", transpose=False)
     values = table.values.astype(np.uint8) if table.values.dtype.kind == "b" else table.values
     if values.dtype.kind not in "iuf" or values.ndim < 2 or not values.size:
         raise FormatError(
@@ -84,6 +88,15 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
             f"frame {index[0] + 1}, taxel {taxel} is {value:g}; {limit}fill it in or cut it away"
         )
     return chosen, time_s, notes
+
+
+def _turned(table: Table) -> Table:
+    """A table of a row for each taxel as one of a column for each, with the name before the row.
+    Raises FormatError for a cell that is not a number."""
+    numbers = [i for i in range(table.values.shape[1]) if i not in table.texts]
+    _check_numbers(table, numbers)
+    names = tuple(*table.texts.values()) if len(table.texts) == 1 else ()
+    return replace(table, values=table.values[:, numbers].T, columns=names, texts={}, faults={})
 
 
 def _without_single_axes(values: Array, plan: ImportPlan) -> Array:
@@ -211,6 +224,10 @@ def _dates(name: str, table: Table, at: int) -> Array:
             "2026-01-31 12:00:00.5"
         )
     parts = [one.groupdict("") for one in found if one]
+    if len(places := sorted({one["place"] for one in parts if not one["zone"]})) > 1:
+        raise FormatError(
+            f"column {name} has times in {' and '.join(places)}; write the zone as +01:00"
+        )
     days = _days(name, [one["day"] + one["year"] for one in parts])
     clock = np.array([_clock_s(one) + DAY_S * int(one["since"] or 0) for one in parts])
     if not any(one["day"] for one in parts):  # times of the day begin again at midnight
@@ -253,10 +270,11 @@ def _numbered(day: str) -> str:
 
 def _clock_s(parts: Mapping[str, str]) -> float:
     """The time of the day in seconds, in the zone of its date."""
-    hours, noon = int(parts["hour"]), parts["noon"].lower()
+    hours, noon = int(parts["hour"]), parts["noon"].lower().replace(".", "")
     hours = hours % 12 + 12 * (noon == "pm") if noon else hours
-    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", parts["zone"])
-    offset = 60 * (60 * int(zone[2]) + int(zone[3])) * (1 if zone[1] == "+" else -1) if zone else 0
+    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)?", parts["zone"])
+    minutes = 60 * int(zone[2]) + int(zone[3] or 0) if zone else 0
+    offset = 60 * minutes * (-1 if zone and zone[1] == "-" else 1)
     seconds = float(re.sub("[,:]", ".", parts["second"]) or 0)
     return 3600 * hours + 60 * int(parts["minute"]) + seconds - offset
 
@@ -280,12 +298,14 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     wide, want = values.shape[1], int(np.prod(shape))
     if plan.columns:
         numbers = column_numbers(plan.columns, table.columns, wide, "--columns")
+        numbers = _by_number(numbers, table.columns) if "*" in plan.columns else numbers
     else:
         asked = plan.fields.values() if table.columns else ()
         fields = [one for one in asked if not _is_fact(table, one)]
         others = [column_numbers(one, table.columns, wide, "--field", 1)[0] for one in fields]
         others += [*table.texts, -1 if time_column is None else time_column]
         numbers = [i for i in range(wide) if i not in others]
+        numbers = _by_number(numbers, table.columns)
     _check_numbers(table, numbers)
     if time_column is not None:
         _check_own_times(values, table, time_column, numbers)
@@ -294,8 +314,19 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
         if table.texts and not plan.columns:
             at, texts = next(iter(table.texts.items()))
             why += f"; column {at + 1} is text, such as {texts[0]!r}"
+        why += "".join(f"; {note}" for note in table.notes if "left out: it" in note)
         raise FormatError(why)
     return values[:, numbers].reshape(len(values), *shape)
+
+
+def _by_number(numbers: list[int], names: Sequence[str]) -> list[int]:
+    """Columns in the order of the numbers in their names, if they stand in the order of letters, as
+    s0, s1, s10, s2: programs sort names so, but no skin its taxels."""
+    given = [names[i] for i in numbers] if names else []
+    if not given or len({*given}) < len(given) or given != sorted(given):
+        return numbers
+    key = {name: re.sub(r"\d+", lambda found: f"{int(found[0]):09d}", name) for name in given}
+    return sorted(numbers, key=lambda i: key[names[i]])
 
 
 def _check_own_times(values: Array, table: Table, at: int, taxels: Sequence[int]) -> None:

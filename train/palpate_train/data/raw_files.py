@@ -109,6 +109,10 @@ def read(path: Path, wanted: ReadPlan | None = None) -> Table:
     try:
         return _read(path, wanted or ReadPlan())
     except DAMAGED as e:
+        if "plugin" in str(e) or "filter" in str(e):
+            raise FormatError(
+                f"is packed with a filter that is not here ({e}); repack it: h5repack -f GZIP=1"
+            ) from e
         raise FormatError(f"cannot be read: {' '.join(str(e).split())}; {AGAIN}") from e
 
 

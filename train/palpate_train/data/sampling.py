@@ -44,14 +44,16 @@ def measured_hz(time_s: Array) -> float:
     """The mean frame rate of a recording, without its gaps. Raises FormatError if its times do not
     increase."""
     if not np.isfinite(time_s).all():
-        raise FormatError(
-            f"the time of frame {int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1} is not a number"
-        )
+        first = int(np.flatnonzero(~np.isfinite(time_s))[0]) + 1
+        raise FormatError(f"the time of frame {first} is not a number; fill it in or cut it away")
     steps = np.diff(time_s)
     if not len(steps):
         raise FormatError("holds one frame")
     if len(back := np.flatnonzero(steps < 0)):
-        raise FormatError(f"the time of frame {back[0] + 2} is before that of frame {back[0] + 1}")
+        raise FormatError(
+            f"the time of frame {back[0] + 2} is before that of frame {back[0] + 1}; if a clock "
+            "began again there, cut the file in two, or give --rate instead of --time"
+        )
     if not steps.any():
         raise FormatError("all its times are the same; give --rate instead of --time")
     usual = float(np.median(steps))

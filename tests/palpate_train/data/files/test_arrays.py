@@ -67,7 +67,7 @@ def test_arrays_are_found_beside_others_and_beside_objects(tmp_path: Path):
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
     np.savez(tmp_path / "b.npz", info={"skin": SKIN})
-    with pytest.raises(FormatError, match="0 arrays"):
+    with pytest.raises(FormatError, match="no array"):
         raw_files.read(tmp_path / "b.npz")
 
 
@@ -160,6 +160,7 @@ FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
         (json.dumps({"who": "Ada", "frames": FRAMES}).encode(), "'frames'"),
         (lines({"type": "head", "rate": 10}, *FRAMES), "1 is passed"),
         (b",\n".join(json.dumps(x).encode() for x in FRAMES), ""),
+        (lines(*({"t": str(x["t"]), "skin": list(map(str, x["skin"]))} for x in FRAMES)), ""),
         (b"[\n" + b",\n".join(json.dumps(x).encode() for x in FRAMES) + b",\n]", ""),
         (
             json.dumps(
@@ -198,6 +199,10 @@ def test_lists_of_json_are_named_and_null_is_a_fault(tmp_path: Path):
     assert found.faults.keys() == {0}
     assert "line 2, a is None" in found.faults[0]
     assert found.values[:, 1].tolist() == [2, 3, 3]
+    (tmp_path / "a.jsonl").write_bytes(lines({"b": 1, "a": 2}, {"a": True, "b": 3}))
+    found = raw_files.read(tmp_path / "a.jsonl")
+    assert "line 2, a is True" in found.faults[0]
+    assert (found.columns, found.values[:, 1].tolist()) == (("a", "b"), [1, 3])
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,7 @@ def test_parquet_is_read(tmp_path: Path):
         "image": [b"x"] * 40,
         "both": [{"left": k, "right": {"deep": -k}} for k in range(40)],
         "exact": [Decimal(k) / 4 for k in range(40)],
+        "since": pa.array([250 * k for k in range(40)], pa.duration("ms")),
     }
     parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
     found = raw_files.read(tmp_path / "a.parquet")
@@ -110,8 +111,12 @@ def test_parquet_is_read(tmp_path: Path):
         np.testing.assert_array_equal(found.values[:, start : start + 4], SKIN)
     assert found.texts[13][0] == "Ada"
     assert found.faults == {14: "row 1 of hole is empty"}
-    assert found.columns[15:] == ("both.left", "both.right.deep", "exact")
-    assert found.values[8, 15:].tolist() == [8, -8, 2]
+    assert found.columns[15:] == ("both.left", "both.right.deep", "exact", "since")
+    assert found.values[8, 15:18].tolist() == [8, -8, 2]
+    assert found.texts[18][5] == "0:00:01.250000"
+    with pa.ipc.new_stream(tmp_path / "a.arrow", pa.table(columns).schema) as stream:
+        stream.write_table(pa.table(columns))
+    assert raw_files.read(tmp_path / "a.arrow").columns == found.columns
     assert ["image" in said for said in found.notes] == [True]
 
 

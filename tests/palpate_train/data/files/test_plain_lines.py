@@ -41,6 +41,7 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
         (lambda row: f'{row[0]};"[{row[1]} {row[2]} {row[3]}]"', "lists"),
         (joined(",", "{} mV"), "units"),
         (joined(";", "{}N"), "units"),
+        (joined(";", "{} kΩ"), "units"),
         (joined(",", "{:x}".replace("{", "0x{")), "hexadecimal"),
         (joined(",", "{}.0D+00"), "exponents"),
         (labelled(",", ":"), ""),
@@ -79,12 +80,19 @@ def test_signs_of_typographers_are_read(tmp_path: Path):
 @pytest.mark.parametrize("sign", [",", " "])
 @pytest.mark.parametrize(
     ("before", "mark", "clock"),
-    [("", " -> ", "12:00:01.100"), ("[2026-01-31 ", "] ", "2026-01-31T12:00:01.100")],
+    [
+        ("", " -> ", "12:00:01.100"),
+        ("", ": ", "12:00:01.100"),
+        ("2026-01-31 ", " ", "2026-01-31T12:00:01.100"),
+        ("[2026-01-31 ", "] ", "2026-01-31T12:00:01.100"),
+    ],
 )
 def test_the_serial_monitors_clock_is_a_column(
     tmp_path: Path, before: str, mark: str, clock: str, sign: str
 ):
-    """Of Arduino and of Tera Term. With labels, too; its times can be used."""
+    """Of Arduino, picocom, CoolTerm and Tera Term. With labels, too; its times can be used."""
+    if sign == mark[-1] and mark.strip(": ") == "":
+        return  # blanks alone do not end a time
     text = "\n".join(
         f"{before}12:00:0{i // 10}.{i % 10}00{mark}" + sign.join(map(str, row))
         for i, row in enumerate(SKIN.tolist())
@@ -93,12 +101,23 @@ def test_the_serial_monitors_clock_is_a_column(
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     assert found.texts[0][11] == clock
-    if sign == " ":
+    if sign == " " or mark in (" ", ": "):
         return
     (tmp_path / "a.txt").write_text(text.replace(mark, f"{mark}force:").replace(",", ",b:"))
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     assert found.columns == ("clock", "force", "b", "b", "b")
+
+
+def test_what_a_decoration_may_mean_is_not_left_out(tmp_path: Path):
+    """A column that changes from mV to V; a number in parentheses, which may be negative."""
+    lines = [f"{a} mV;{b} mV" for a, b in SKIN[:, :2].tolist()]
+    lines[7] = lines[7].replace("mV", "V", 1)
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match="V, line 1 in mV"):
+        raw_files.read(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("\n".join(f"({a});{b}" for a, b in SKIN[:, :2].tolist()))
+    assert raw_files.read(tmp_path / "a.csv").texts[0][0] == f"({SKIN[0, 0]})"
 
 
 def test_comments_behind_numbers_and_with_slashes(tmp_path: Path):

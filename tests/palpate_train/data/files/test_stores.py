@@ -98,6 +98,13 @@ def test_messages_of_json(tmp_path: Path):
         raw_files.read(path, ReadPlan("/other"))
     with pytest.raises(FormatError, match="recover"):
         raw_files.read(messages(tmp_path / "b.mcap", end=False))
+    with (tmp_path / "c.mcap").open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/skin", "protobuf", 0), 0, b"\0", 0)
+        writer.finish()
+    with pytest.raises(FormatError, match=r"/skin \(protobuf\)"):
+        raw_files.read(tmp_path / "c.mcap")
 
 
 @pytest.mark.slow

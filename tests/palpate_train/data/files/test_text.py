@@ -123,6 +123,8 @@ def test_a_separator_at_a_wrong_place_is_a_fault(usual: str, cell: str, decimal:
         ("@@\n", "'@@'"),
         ('"@@"\n', "'\"@@\"'"),
         ("End of recording\n", "'End"),
+        ("25.5,25.5,25.5,Mean\n", "'25.5"),
+        (",25.5,25.5,25.5\n", "',25.5"),
         ("\nMean of column a: 12.5\nby hand\n", "column a: 12.5'"),
         ("310,31", "cut off: 2"),
         ("310,311,", "cut off: 2"),
@@ -137,7 +139,9 @@ def test_what_follows_the_frames_is_said(end: str, note: str):
 
 
 def test_text_and_bytes_between_frames_are_refused():
-    """A second head or table, a block of NULs, a cell of 256 kB."""
+    """A second head or table, a row of statistics, a block of NULs, a cell of 256 kB."""
+    with pytest.raises(FormatError, match="32 begins with 'Sum'"):
+        read(HEAD + BODY + "Sum,25.5,25.5,25.5\n" + BODY)
     with pytest.raises(FormatError, match="32 has 1"):
         read(HEAD + BODY + "again\n" + BODY)
     assert read(HEAD + BODY + HEAD + BODY).faults[0].startswith("line 32, column 1 is 'a'")
@@ -183,7 +187,7 @@ def test_columns_may_be_named_by_numbers(first: int):
     assert len(read(labels).values) == len(ROWS) + 1  # all rows begin with a word
 
 
-@pytest.mark.parametrize("word", ["Mean", '"Max"', "std dev", "2\u03c3", "95 % CI", "1st quartile"])
+@pytest.mark.parametrize("word", ["Mean", '"Max"', "std dev", "2\u03c3", "95 % CI", "75%"])
 def test_rows_of_statistics_are_no_frames(word: str):
     """A word where all frames have a number, above or below: left out, and said."""
     row = f"{word},25.5,25.5,25.5\n"
@@ -207,15 +211,19 @@ def test_names_stand_on_the_last_line_before_the_numbers():
 WIDE = [[7 * r + c * c for c in range(16)] for r in range(1, 31)]
 
 
-@pytest.mark.parametrize("count", [range(16), range(1, 17), range(17, 33)])
+PLACES = [10 * row + column for row in range(1, 5) for column in range(1, 5)]
+
+
+@pytest.mark.parametrize(
+    "count", [range(16), range(1, 17), range(17, 33), range(16, 0, -1), range(0, 32, 2), PLACES]
+)
 @pytest.mark.parametrize("form", ["{}", "{:02d}", "{}.0", '"{}"'])
 @pytest.mark.parametrize(
     ("word", "before"), [("time", "1.5,"), ("label", "cork,"), ("", "3,"), (None, "")]
 )
 def test_many_numbers_that_count_are_no_frame(count, form, word, before):
-    """Columns named by numbers; a frame that begins so stays."""
-    if word is None and (count[0] > 1 or form != "{}"):
-        return  # all are numbers: only 0 or 1 can be meant as the first column
+    """Columns named by numbers, by their places or by rows and columns; a frame that begins so
+    stays."""
     rows = [before + ",".join(map(str, row)) for row in WIDE]
     head = ",".join([*([word] if word is not None else []), *map(form.format, count)])
     found = read("\n".join([head, *rows]))
@@ -223,6 +231,20 @@ def test_many_numbers_that_count_are_no_frame(count, form, word, before):
     np.testing.assert_array_equal(found.values[:, -16:], WIDE)
     if word == "label":
         assert len(read("\n".join([head.replace("label", "cork"), *rows])).values) == 31
+
+
+def test_a_row_of_the_number_of_frames_is_no_frame():
+    """BIOPAC writes it for each channel, perhaps not for the time; frames that count stay."""
+    for row in ("30,30,30,30\n", ",30,30,30\n"):
+        np.testing.assert_array_equal(read(HEAD + row + BODY).values, ROWS)
+    ramp = "".join(",".join(map(str, range(k, k + 16))) + "\n" for k in range(30))
+    assert len(read(ramp).values) == 30
+
+
+@pytest.mark.parametrize(("text", "shown"), [("", "empty"), ("1^2^3\n" * 9, r"'1\^2\^3'")])
+def test_a_text_without_numbers_shows_one_of_its_lines(text: str, shown: str):
+    with pytest.raises(FormatError, match=shown):
+        read(text)
 
 
 LVM = """LabVIEW Measurement\t

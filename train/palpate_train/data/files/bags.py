@@ -59,8 +59,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     kind = path.suffix.lower()
     if not WHOLE.get(kind, lambda _: True)(path):
         raise FormatError(f"has no end, as if it was cut off; {MENDED[kind]} makes it whole")
-    if kind == ".mcap" and mcap_json.may_hold(path) and (table := mcap_json.read(path, wanted)):
-        return table
+    if kind == ".mcap" and mcap_json.may_hold(path):
+        return mcap_json.read(path, wanted)
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
     with _opened(highlevel, source, store, MENDED.get(kind, "")) as bag:
         topics: dict[str, list[Any]] = {}

@@ -73,7 +73,7 @@ def _evidence(cell: str) -> str:
     thousands, "" if it shows none."""
     cell = cell.strip()
     last = max(cell.rfind(","), cell.rfind("."))
-    if last < 0:
+    if last < 0 or not is_number(cell):
         return ""
     sign = cell[last]
     other = "." if sign == "," else ","

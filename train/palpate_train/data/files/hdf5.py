@@ -15,7 +15,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.files import octave
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal, unpacked
 from palpate_train.data.readers import array_in
 
 CLASS = "MATLAB_class"
@@ -59,7 +59,7 @@ def _facts(file: h5py.File, name: str) -> dict[str, str]:
         inside = [k for k in at if _holds(at, k)] if isinstance(at, h5py.Group) else []
         single = {k: array_in(at, k) for k in inside if _is_single(at[k])}
         said = {**single, **at.attrs}
-        found |= {normal(k): _said(v) for k, v in said.items() if np.ndim(v) == 0}
+        found |= {normal(k): _said(v) for k, v in said.items() if np.size(v) == 1}
     return found
 
 
@@ -95,13 +95,17 @@ def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:
         kind = kind.decode("ascii", "replace") if isinstance(kind, bytes) else kind
         kind = kind if isinstance(kind, str) else None
         if kind is None and not (matlab and one.dtype.kind in "biuf"):
-            found[name] = Entry.of(one.shape, one.dtype, partial(array_in, file, name))
+            found[name] = Entry.of(one.shape, one.dtype, partial(_read, file, name))
         elif kind in (None, *NUMERIC) and "MATLAB_empty" not in one.attrs:
             # MATLAB stores by columns, with its own order of axes
             found[name] = Entry.of(one.shape[::-1], one.dtype, partial(_reversed, file, name))
 
     file.visititems(keep)
     return found
+
+
+def _read(file: h5py.File, name: str) -> Array:
+    return unpacked(array_in(file, name), file[name].attrs)
 
 
 def _octave(file: h5py.File) -> Mapping[str, Entry]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,8 @@ from palpate_train.data.files.table import (
 )
 from palpate_train.data.files.text import decoded, lines_of
 
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+"""A number, as programs write it in quotes."""
 SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 
 
@@ -159,20 +162,26 @@ def table_of(
 ) -> Table:
     """A table of frames with their numbers. what: how a message calls one. Raises FormatError."""
     names = list(frames[0][1])
+    if any(list(frame) != names for _, frame in frames):
+        names = sorted(names)  # no order of its own; numbers in names will give it
     columns: list[Column] = []
     faults: dict[int, str] = {}
     for i, frame in frames:
-        if list(frame) != names and set(frame) != set(names):
+        if len(frame) != len(names) or set(frame) != set(names):
             odd = sorted(set(frame) ^ set(names))[0]
             has = "has" if odd in frame else "lacks"
             raise FormatError(f"{what} {i} {has} {odd!r}, unlike {what} {frames[0][0]}")
     for k, name in enumerate(names):
         values = [frame[name] for _, frame in frames]
         words = sum(isinstance(value, str) for value in values)
+        if words == len(values) and all(map(NUMBER.fullmatch, values)):
+            values, words = list(map(float, values)), 0
         if 2 * words > len(values):
             columns.append((name, list(map(str, values))))
             continue
-        numbers = [v if isinstance(v, int | float) else None for v in values]
+        flags = all(isinstance(v, bool) for v in values)  # true is no count
+        kinds = (bool,) if flags else (int, float)
+        numbers = [v if type(v) in kinds else None for v in values]
         for (i, _), number, value in zip(frames, numbers, values, strict=True):
             if number is None:
                 faults.setdefault(k, f"{what} {i}, {name} is {value!r}, which is not a number")

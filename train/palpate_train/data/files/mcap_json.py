@@ -26,21 +26,24 @@ Message = tuple[int, Any]
 
 
 def may_hold(path: Path) -> bool:
-    """Whether an MCAP file is of no version of ROS, as its header says (mcap.dev/spec)."""
+    """Whether an MCAP file is not of ROS 2, as its header says (mcap.dev/spec)."""
     with path.open("rb") as file:
         head = file.read(MAGIC_BYTES + 1 + 8 + 4)
         if len(head) < MAGIC_BYTES + 13:
             return False
         (length,) = struct.unpack_from("<I", head, MAGIC_BYTES + 9)
-        return not file.read(min(length, 16)).startswith(b"ros")
+        return not file.read(min(length, 16)).startswith(b"ros2")
 
 
-def read(path: Path, wanted: ReadPlan) -> Table | None:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The messages of the only topic with numbers, or of the topic `wanted.variable`, one frame
-    each; None if no topic is JSON. Raises FormatError that lists the topics."""
-    topics = _topics(path)
+    each. Raises FormatError that lists the topics."""
+    topics, others = _topics(path)
     if not topics:
-        return None
+        raise FormatError(
+            f"holds no topic of JSON or ROS 2, but {', '.join(others) or 'nothing'}; record in one "
+            "of the two"
+        )
     known = dict.fromkeys(topics, "JSON")
     name = only("topic", known, wanted.variable, lambda n: _numbers(topics[n]) > 1)
     messages = topics[name]
@@ -55,13 +58,17 @@ def read(path: Path, wanted: ReadPlan) -> Table | None:
     return labelled(table, at_ns, said)
 
 
-def _topics(path: Path) -> dict[str, list[Message]]:
-    """The messages of each topic that is JSON, in the order of their times."""
+def _topics(path: Path) -> tuple[dict[str, list[Message]], list[str]]:
+    """The messages of each topic that is JSON, in the order of their times, and the other topics
+    with their encodings."""
     reader = library("mcap.reader", "MCAP with JSON")
     topics: dict[str, list[Message]] = {}
+    others: dict[str, None] = {}
     with path.open("rb") as file:
         for _, channel, message in reader.make_reader(file).iter_messages():
-            if channel.message_encoding == JSON:
+            if channel.message_encoding != JSON:
+                others[f"{printable(channel.topic)} ({printable(channel.message_encoding)})"] = None
+            else:
                 known = topics.setdefault(normal(channel.topic), [])
                 try:
                     known.append((message.log_time, json.loads(message.data)))
@@ -70,7 +77,7 @@ def _topics(path: Path) -> dict[str, list[Message]]:
                         f"message {len(known) + 1} of {printable(channel.topic)} is not JSON, as "
                         f"its encoding says: {e}; record it again"
                     ) from e
-    return topics
+    return topics, list(others)
 
 
 def _numbers(messages: list[Message]) -> int:

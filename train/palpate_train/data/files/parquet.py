@@ -12,7 +12,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
 from palpate_train.data.files.table import Array, Column, ReadPlan, Table, from_columns, parted
 
-SUFFIXES = (".parquet", ".pq", ".feather", ".arrow")
+SUFFIXES = (".parquet", ".pq", ".feather", ".arrow", ".arrows", ".ipc")
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:
@@ -24,7 +24,11 @@ def read(path: Path, wanted: ReadPlan) -> Table:
 def arrow(path: Path, columns: Sequence[str] | None = None) -> Any:
     """pyarrow's table. columns: the names of those to read, None for all."""
     library("pyarrow", "a Parquet or Feather file")
-    if path.suffix.lower() in (".feather", ".arrow"):
+    if path.suffix.lower() in (".feather", ".arrow", ".arrows", ".ipc"):
+        with path.open("rb") as file:
+            if file.read(4) not in (b"ARRO", b"FEA1"):
+                file.seek(0)
+                return library("pyarrow", "a stream of Arrow").ipc.open_stream(file).read_all()
         feather = library("pyarrow.feather", "a Feather file")
         return feather.read_table(str(path), columns=columns)
     parquet = library("pyarrow.parquet", "a Parquet file")
@@ -40,7 +44,7 @@ def table(content: Any) -> Table:
         content = content.flatten()
     for name in content.column_names:
         values, kind = content.column(name), str(content.column(name).type)
-        if kind.startswith(("string", "large_string", "dictionary", "date", "timestamp[")):
+        if kind.startswith(("string", "large_string", "dictionary", "date", "time", "duration")):
             columns.append((name, [str(v) for v in values.to_pylist()]))
             continue
         try:

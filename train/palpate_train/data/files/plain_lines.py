@@ -12,24 +12,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from palpate.core.errors import FormatError
+
 SAMPLED = 200
 """Number of lines that show the decorations of a text."""
 USUAL = 0.8
 """Share of the lines with digits that have a decoration, if it is removed."""
 _STAMP = r"(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d(?:[.,]\d+)?"
-CLOCK = re.compile(rf"^\s*\[?({_STAMP})(?:\]|\s*->)\s*(.*)$")
-"""The time that the serial monitor of Arduino, or Tera Term in brackets, writes before a line."""
+_BARE = r":?(?=[ \t]+(?:\d|-(?!\d\d:?\d\d\b))[^ ]*[,;\t])"
+CLOCK = re.compile(rf"^\s*\[?({_STAMP})(?:\]|\s*->|{_BARE})\s*(.*)$")
+"""The time that the serial monitor of Arduino, Tera Term in brackets, or CoolTerm before a blank,
+writes before a line."""
 LABEL = re.compile(r"(?<![\w.])([A-Za-z_][\w.\-\[\]]*)\s*[=:]\s*(?=[-+.\d])")
 BYTES = re.compile(r"^\s*b(['\"])(.*?)(?:\\r)?(?:\\n)?\1\s*$")
 """A line of bytes as Python prints it."""
 CELL = re.compile(r'"\[\s*([-+.\d][-+.\deE, ]*?)\s*\]"')
 """A list in a cell, as pandas writes it."""
+OWN = re.compile(r"\(\s*\d+[.,]?\d*\s*\)\s*[;\t|]|\(\s*\d+(?:\.\d*)?\s*\)\s*,")
+"""A number in parentheses of its own, as accountants write negative ones."""
 BRACKETS = re.compile(rf"^\s*(?!\[{_STAMP}\])(?:array|tensor)?\s*" + r"[\[({].*\d")
 QUOTED = re.compile(r"'([^',;\t]*\d)'")
 HEXADECIMAL = re.compile(r"(?<![\w.])0[xX]([0-9a-fA-F]{1,8})(?![\w.])")
 FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d)")
 UNITS = re.compile(
-    r"(?<=\d)\s?(?:[kmuµn]?(?:N|V|A|Pa|g)|%|bar|psi|°C|counts?)(?=\s*(?:[,;\t|\])]|$))"
+    r"(?<=\d)\s?(?:[kmuµn]?(?:N|V|A|Pa|g|Ω|Ohm)(?:/[cm]?m[2²])?|%|bar|psi|mmHg|°C|counts?)"
+    r"(?=\s*(?:[,;\t|\])]|$))"
 )
 REMARK = re.compile(r"(?<=\d)\s+(?:#|//)\s.*$")
 """A comment behind the numbers of a line."""
@@ -57,6 +64,7 @@ def plain(lines: Sequence[str]) -> PlainText:
     for one in _REWRITINGS:
         found = sum(bool(one.shows(line)) for line in (lines if one.seldom else some))
         if found and (one.seldom or found >= USUAL * len(some)):
+            one.check(lines)
             lines, some = (
                 [one.rewrite(line) if one.shows(line) else line for line in part]
                 for part in (lines, some)
@@ -99,6 +107,24 @@ def _separated(line: str) -> bool:
     return any(sign in line for sign in ";\t|") and bool(BLANK_THOUSANDS.search(line))
 
 
+def _bracketed(line: str) -> bool:
+    return bool(BRACKETS.match(line)) and not OWN.search(line)
+
+
+def _one_unit(lines: Sequence[str]) -> None:
+    """Raises FormatError if the unit of a column changes, as from mV to V."""
+    known: dict[int, tuple[str, int]] = {}
+    for i, line in enumerate(lines, 1):
+        sign = next((sign for sign in "\t;|" if sign in line), ",")
+        for found in UNITS.finditer(line):
+            unit = found[0].strip()
+            first, at = known.setdefault(line.count(sign, 0, found.start()), (unit, i))
+            if unit != first:
+                raise FormatError(
+                    f"line {i} has values in {unit}, line {at} in {first}; write one unit"
+                )
+
+
 def _unbracketed(line: str) -> str:
     return re.sub(r"^\s*(array|tensor)", "", line).translate(_NO_BRACKETS).strip(" ,")
 
@@ -106,12 +132,13 @@ def _unbracketed(line: str) -> str:
 @dataclass(frozen=True)
 class Rewriting:
     """A decoration. what: its name. shows: whether a line has it. rewrite: removes it. seldom: it
-    cannot be anything else, so a single line suffices."""
+    cannot be anything else, so a single line suffices. check: refuses lines that differ in it."""
 
     what: str
     shows: Callable[[str], object]
     rewrite: Callable[[str], str]
     seldom: bool = False
+    check: Callable[[Sequence[str]], None] = lambda _: None
 
 
 _NO_BRACKETS = str.maketrans("", "", "[](){}")
@@ -119,9 +146,9 @@ _REWRITINGS = (
     Rewriting("comments behind numbers", REMARK.search, partial(REMARK.sub, ""), True),
     Rewriting("marks of bytes", BYTES.search, partial(BYTES.sub, r"\2")),
     Rewriting("brackets of lists", CELL.search, partial(CELL.sub, _spread)),
-    Rewriting("brackets", BRACKETS.match, _unbracketed),
+    Rewriting("brackets", _bracketed, _unbracketed),
     Rewriting("single quotes", QUOTED.search, partial(QUOTED.sub, r"\1")),
-    Rewriting("units of the cells", UNITS.search, partial(UNITS.sub, "")),
+    Rewriting("units of the cells", UNITS.search, partial(UNITS.sub, ""), check=_one_unit),
     Rewriting("separators of thousands", THOUSANDS.search, partial(THOUSANDS.sub, ""), True),
     Rewriting("separators of thousands", _separated, partial(BLANK_THOUSANDS.sub, ""), True),
     Rewriting("D in exponents", FORTRAN.search, partial(FORTRAN.sub, "e")),

@@ -26,21 +26,22 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     if variable and variable not in sheets:
         raise FormatError(f"has no sheet {variable!r}; it holds {', '.join(sheets)}")
     tables: dict[str, Table] = {}
-    why = "holds no line of numbers"
+    without = text.no_numbers(())
     for name in [variable] if variable else sheets:
         rows = book.get_sheet_by_name(sheets[name]).to_python(skip_empty_area=False)
         rows, notes = _filled(rows)
         try:
             tables[name] = text.table(_lines(rows), wanted, notes, delimiter=",", decimal=".")
         except FormatError as e:
-            if str(e) != why:
+            if not str(e).startswith(text.NO_NUMBERS):
                 raise FormatError(f"sheet {name}: {e}") from e
+            without = e
     if len(tables) > 1:
         raise FormatError(
             f"holds {len(tables)} sheets of frames, {', '.join(tables)}; name one with --variable"
         )
     if not tables:
-        raise FormatError(why)
+        raise without
     return next(iter(tables.values()))
 
 

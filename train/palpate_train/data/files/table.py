@@ -27,6 +27,8 @@ LEAST_SERIES = 20
 """Smallest number of arrays that are the frames of one recording."""
 RUNNING = re.compile(r"(.*?)(\d+)(\D*)")
 """A name with a running number."""
+KINDS = {"O": " of objects", "S": " of texts", "U": " of texts", "c": " of complex numbers"}
+"""Kinds of arrays that hold no frames, by NumPy's letter."""
 LONGEST = 40
 """Longest excerpt of a cell in an error message."""
 
@@ -132,8 +134,21 @@ def excerpt(text: str) -> str:
     return repr(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…")
 
 
-def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
-    """The only array of frames, or the array `wanted.variable`, with the times beside it.
+def unpacked(values: Array, attributes: Mapping[str, Any]) -> Array:
+    """Numbers as they were before xarray or netCDF packed them into counts (CF conventions, 8.1);
+    NaN where none was."""
+    if not {"scale_factor", "add_offset"} & set(attributes):
+        return values
+    scale, offset = (
+        np.asarray(attributes.get(name, usual), np.float64).item()
+        for name, usual in (("scale_factor", 1), ("add_offset", 0))
+    )
+    return np.where(values == attributes.get("_FillValue"), np.nan, values * scale + offset)
+
+
+def chosen(entries: Mapping[str, Entry], wanted: ReadPlan, ends: Sequence[int] = ()) -> Table:
+    """The only array of frames, or the array `wanted.variable`, with the times beside it, and
+    texts or numbers for each frame or recording that `wanted.fields` asks for. ends: as in Table.
 
     No other array is read. Raises FormatError that lists the arrays if none or several fit.
     """
@@ -150,19 +165,39 @@ def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
         inside = {n: e for n, e in numbers.items() if re.match(rf"{re.escape(name)}[/.({{]", n)}
         if len(found) != 1 and inside:
             beside = {time: numbers[time]} if time in numbers else {}
-            return chosen(inside | beside, replace(wanted, variable=""))
+            return chosen(inside | beside, replace(wanted, variable=""), ends)
         if len(found) != 1:
             raise FormatError(f"has no array {name!r}; it holds {listed}")
         (name,) = found
     tables = {name: numbers[name]} if name else {n: e for n, e in numbers.items() if e.holds_frames}
     table = _only(tables) or _series(tables) or (None if tables else _columns(numbers, time))
+    if table is None and not tables:
+        raise FormatError(f"holds no array of frames x taxels, but {_listed(entries)}; save one")
     if table is None:
         raise FormatError(
             f"holds {len(tables)} arrays of frames; name one with --variable: it holds {listed}"
         )
     vectors = {n: e for n, e in numbers.items() if e.is_vector and n != name}
     asked = {time: vectors[time].read().ravel()} if time in vectors else {}
-    return replace(table, vectors=asked, beside=tuple(vectors))
+    labels = _labels(entries, wanted.fields, ends, len(table.values))
+    return replace(table, vectors=asked, beside=tuple(vectors), labels=labels, ends=tuple(ends))
+
+
+def _labels(
+    entries: Mapping[str, Entry], fields: Sequence[str], ends: Sequence[int], count: int
+) -> dict[str, list[str]]:
+    """Arrays of these names that hold a text or a number for each of `count` frames, or for each
+    recording, as texts."""
+    found: dict[str, list[str]] = {}
+    for asked in fields:
+        named = [e for n, e in entries.items() if asked in (n, n.rpartition("/")[2])]
+        if len(named) != 1 or named[0].size not in (count, len(ends)):
+            continue
+        texts = as_texts(named[0].read().ravel().tolist())
+        of_recordings = len(texts) == len(ends) and len(texts) != count
+        repeats = np.diff([0, *ends]).tolist() if of_recordings else [1] * count
+        found[asked] = [text for text, n in zip(texts, repeats, strict=True) for _ in range(n)]
+    return found
 
 
 def _only(tables: Mapping[str, Entry]) -> Table | None:
@@ -204,6 +239,7 @@ def _listed(numbers: Mapping[str, Entry]) -> str:
     texts = [
         f"{printable(name)} {list(entry.shape)}"
         + (f" of {', '.join(map(printable, entry.fields))}" if entry.fields else "")
+        + KINDS.get(entry.kind, "") * (not entry.fields)
         for name, entry in numbers.items()
     ]
     more = [f"and {len(texts) - MOST_LISTED} more"] if len(texts) > MOST_LISTED else []

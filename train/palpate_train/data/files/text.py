@@ -27,7 +27,10 @@ DELIMITERS = ("\t", ";", "|", ",", None)
 """What can separate columns. Without any of the signs, blanks do."""
 SHEET_ERROR = re.compile(r"[\"']?#(N/A|N/V|NV|[A-ZÄÖÜ0-9/]+[!?])")
 """How spreadsheets write a cell without a value. It is not a comment."""
-MISSING = {"", "na", "n/a", "null", "none", "-", "--", "?", "nil", "err", "error", "overflow"}
+MISSING = {
+    *("", "na", "n/a", "n.a.", "null", "none", "-", "--", "?", "nil", "err", "error"),
+    *("missing", "invalid", "overflow", "ovf", "overrange", "sat"),
+}
 UNIT = re.compile(
     r"[\[(].*[\])]|[kmuµn]?(s|sec|V|N|A|Pa|g|m|T)|%|°C|bar|psi|counts?|raw|lsb|digits?|a\.?u\.?|-?",
     re.IGNORECASE,
@@ -35,11 +38,13 @@ UNIT = re.compile(
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?:[kmuµn]?(?:s|sec|V|N|A|Pa|g|m|Hz)|%)")
 """A number with its unit, as in the rows of ranges below names."""
 LEAST_COUNTED = 8
-"""From more numbers 1, 2, 3 ... on a line is no frame, whatever the frames are like."""
+"""From more numbers 1, 2, 3 ..., or other even steps, a line is no frame, whatever the frames are
+like."""
 SAMPLED = 200
 """Number of lines at the start and at the end that show the layout of a text."""
 CLEAR = 0.9
 """A sign separates the columns if the share of numbers between it is this part of the largest."""
+NO_NUMBERS = "holds no line of numbers"
 HEAD = 4096
 """Number of bytes at the start that show whether a file is a text."""
 _CONTROL = re.compile(rb"[^\t\n\f\r\x1a\x1b\x20-\xff]")
@@ -197,7 +202,7 @@ def _layout(kept: Sequence[Row], delimiter: str) -> Layout:
     best = next(way for way, share in shares.items() if share >= CLEAR * max(shares.values()))
     found = [cells(line, best) for line in sample if _share(line, best)]
     if not found:
-        raise FormatError("holds no line of numbers")
+        raise no_numbers(kept)
     counts = Counter(map(len, found))
     wide = max(counts, key=lambda n: (counts[n], n))
     # the last column may be empty in most lines, but not in all
@@ -242,6 +247,7 @@ def _marked(line: str) -> bool:
 
 def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
     """The first frame and the end of the frames among the lines that are not blank."""
+    last = len(kept) - 1
     start = next(
         (
             k
@@ -250,11 +256,13 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
             and layout.is_frame(line)
             and not _counts_columns(kept[k : k + 2], layout)
             and not _is_summary(layout.cells(line), layout)
+            and not _counts_frames(layout.cells(line), len(kept) - k - 1)
+            and not _untimed(*(layout.cells(one) for _, one in (kept[k], kept[min(k + 1, last)])))
         ),
         len(kept),
     )
     if start == len(kept):
-        raise FormatError("holds no line of numbers")
+        raise no_numbers(kept)
     end = len(kept)
     while end > start + 1 and _is_footer(kept[end - 2 : end], layout, end == len(kept)):
         end -= 1
@@ -266,28 +274,58 @@ def _counts_columns(lines: Sequence[Row], layout: Layout) -> bool:
     pandas. Without a word, or if all frames begin with one, it has LEAST_COUNTED numbers. If the
     line below begins alike, it is a frame."""
     first, below = (list(map(_bare, layout.cells(line))) for _, line in (lines[0], lines[-1]))
-    long, starts = layout.wide > LEAST_COUNTED, ("0", "1")
+    long = layout.wide > LEAST_COUNTED
     if is_number(first[0]):
-        return long and first[0] in starts and _is_count(first) and first != below
-    clear = long or (0 not in layout.text_columns and first[1] in starts)
+        return long and _is_count(first) and not _is_count(below)
+    clear = long or (0 not in layout.text_columns and first[1] in ("0", "1"))
     return clear and _is_count(first[1:]) and first[0] != below[0]
 
 
 def _is_count(found: Sequence[str]) -> bool:
-    """Whether cells are numbers that rise by one each."""
-    if not found or not all(map(is_number, found)):
+    """Whether cells are numbers that rise by one each; more of them may have other even steps, or
+    those of rows and columns: 11, 12, 13, 14, 21, 22 ..."""
+    if len(found) < 2 or not all(map(is_number, found)):
         return False
-    counts = [float(plain(cell, ".")) for cell in found]
-    return counts == [counts[0] + k for k in range(len(counts))]
+    counts = np.array([float(plain(cell, ".")) for cell in found])
+    steps = np.round(np.diff(counts), 6)
+    if len(found) < LEAST_COUNTED:
+        return bool((steps == 1).all())
+    wide = next((k for k, step in enumerate(steps, 1) if step != steps[0]), len(counts))
+    if not steps[0] or wide < 2 or len(counts) % wide:
+        return False
+    rows = np.round(np.diff(counts.reshape(-1, wide), axis=0), 6)
+    return bool((rows == rows[:1, :1]).all())
 
 
-def _is_summary(found: Sequence[str], layout: Layout) -> bool:
-    """Whether a line beside the frames begins with a word where all frames have a number, such as
-    Mean, SD, Min or Max."""
-    first = _bare(found[0]).lstrip("#%/ ")
-    word = any(map(str.isalpha, first)) and not is_number(first) and first.lower() not in MISSING
-    word = word and not SHEET_ERROR.match(found[0].strip())
-    return word and 0 not in layout.text_columns and layout.wide > 1
+def _counts_frames(found: Sequence[str], frames: int) -> bool:
+    """Whether each cell is the number of the frames below, as BIOPAC writes it."""
+    return frames > 1 and {cell.strip() for cell in _trimmed(list(found))} == {str(frames)}
+
+
+def _is_summary(found: Sequence[str], layout: Layout, at: int = 0) -> bool:
+    """Whether a line has a word where all frames have a number, such as Mean, SD, 75% or Max. at:
+    the column, its first one or its last one."""
+    cell = _bare(found[at]).lstrip("#%/ ")
+    word = any(map(str.isalpha, cell)) or cell.endswith("%")
+    word = word and not is_number(cell) and cell.lower() not in MISSING
+    word = word and not SHEET_ERROR.match(found[at].strip())
+    return word and at % layout.wide not in layout.text_columns and layout.wide > 1
+
+
+def _untimed(found: Sequence[str], beside: Sequence[str]) -> bool:
+    """Whether a line lacks the first number, which the line beside it has."""
+    return not found[0].strip() and is_number(beside[0])
+
+
+def no_numbers(kept: Sequence[Row]) -> FormatError:
+    """The error about a text without frames."""
+    if not kept:
+        return FormatError(f"{NO_NUMBERS}: it is empty; export it again, with values")
+    i, line = kept[len(kept) // 2]
+    return FormatError(
+        f"{NO_NUMBERS}, and line {i} is {excerpt(line.strip())}; write a row of numbers for each "
+        "frame, with commas, semicolons, tabs or blanks between them"
+    )
 
 
 def _is_footer(pair: Sequence[Row], layout: Layout, last: bool) -> bool:
@@ -301,8 +339,11 @@ def _is_footer(pair: Sequence[Row], layout: Layout, last: bool) -> bool:
         return not layout.is_frame(line)
     found = _trimmed(whole)
     given = [is_number(cell) for cell in found]
-    if len(found) == layout.wide and all(given[1:]) and _is_summary(found, layout):
+    complete = len(found) == layout.wide and all(given[1:])
+    if complete and (_is_summary(found, layout) or _untimed(found, before)):
         return True
+    if len(found) == len(before) and all(given[:-1]) and is_number(before[-1]):
+        return _is_summary(found, layout, -1) and len(found[-1].strip()) > 1
     if len(found) < layout.wide and (last or not all(given)):
         return True
     return len(found) != layout.wide and not any(given)
@@ -328,7 +369,7 @@ def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[
         return []
     i, line = rest[0]
     found = _trimmed(layout.cells(line))
-    if len(rest) == 1 and found and is_number(found[0]):
+    if len(rest) == 1 and len(found) < layout.wide and is_number(found[0]):
         return [f"read up to line {i}, which is cut off: {len(found)} of {layout.wide} columns"]
     return [f"read up to line {i}, which is {excerpt(line.strip())}"]
 
@@ -405,6 +446,12 @@ def _columns(
             raise FormatError(
                 f"line {i} has {len(found[-1])} columns, line {rows[0][0]} has {layout.wide}; "
                 "write one row for each frame"
+            )
+        others = [found[-1][c] for c in layout.numbers[1:]]
+        if _is_summary(found[-1], layout) and all(map(is_number, others)):
+            raise FormatError(
+                f"line {i} begins with {excerpt(found[-1][0])}, where other lines have a number; "
+                "leave it out"
             )
     values = np.full((len(rows), layout.wide), math.nan)
     texts: dict[int, list[str]] = {}

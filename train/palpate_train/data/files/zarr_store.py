@@ -4,7 +4,6 @@ is one recording for each episode."""
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -15,7 +14,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, as_texts, chosen, normal
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal, unpacked
 
 SUFFIXES = (".zarr",)
 ROOTS = (".zgroup", ".zarray", "zarr.json")
@@ -55,37 +54,24 @@ def _read(root: Any, wanted: ReadPlan) -> Table:
         name: Entry.of(one.shape, np.dtype(one.dtype), partial(_all, one))
         for name, one in sorted(arrays.items())
     }
-    table = chosen(entries, wanted)
+    table = chosen(entries, wanted, ends)
     count = len(table.values)
     if ends and (ends != sorted(ends) or ends[-1] != count):
         raise FormatError(
             f"{name} ends at {ends[-1]}, but there are {count} frames; name their array with"
             " --variable"
         )
-    groups = (root, *(one for one in inside.values() if not hasattr(one, "shape")))
+    at = wanted.variable if "/" in wanted.variable else ""
+    groups = [root]
+    groups += [
+        one
+        for path, one in sorted(inside.items())
+        if path not in arrays and path != name and (not at or f"{at}/".startswith(f"{path}/"))
+    ]
     said = {k: v for group in groups for k, v in dict(group.attrs).items()}
     facts = {normal(k): str(v) for k, v in said.items() if isinstance(v, str | int | float)}
-    labels = _labels(arrays, wanted, ends, count)
-    return replace(table, ends=tuple(ends), labels=labels, facts=facts)
-
-
-def _labels(
-    arrays: Mapping[str, Any], wanted: ReadPlan, ends: list[int], count: int
-) -> dict[str, list[str]]:
-    """What --field asks for of arrays with a text or a number for each frame or each episode."""
-    found: dict[str, list[str]] = {}
-    for field in wanted.fields:
-        names = [name for name in arrays if field in (normal(name), name.rpartition("/")[2])]
-        values = [
-            _all(arrays[name]).ravel() for name in names if arrays[name].size in (count, len(ends))
-        ]
-        if len(values) == 1 and len(names) == 1:
-            texts = as_texts(values[0].tolist())
-            of_episodes = len(texts) == len(ends) and len(texts) != count
-            repeats = np.diff([0, *ends]).tolist() if of_episodes else [1] * count
-            found[field] = [text for text, n in zip(texts, repeats, strict=True) for _ in range(n)]
-    return found
+    return replace(table, facts=facts)
 
 
 def _all(array: Any) -> Array:
-    return np.asarray(array[...])
+    return unpacked(np.asarray(array[...]), dict(array.attrs))
