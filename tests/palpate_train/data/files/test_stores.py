@@ -7,12 +7,14 @@ from pathlib import Path
 import mcap.writer
 import numpy as np
 import pytest
-import zarr
 
 from palpate.core.errors import FormatError
 from palpate_train.cli.main import main
 from palpate_train.data import raw_files, readers
 from palpate_train.data.files.table import ReadPlan
+from tests.factories.later import Later
+
+zarr = Later("zarr")
 
 SKIN = np.arange(40 * 4, dtype=np.uint16).reshape(40, 4)
 TIMES = np.arange(40) / 10
