@@ -126,9 +126,10 @@ $(DESKTOP): $(RUNTIME) train/pyproject.toml train/desktop.lock
 	@touch $@
 
 # The same with tests, studies, and the tools that check the code. flexitac has no wheel.
+# All that the studies need is in the lock.
 $(TOOLS): $(DESKTOP) tests/tools.lock train/studies/pyproject.toml
 	$(LOCKED) --no-binary flexitac --no-build-isolation -r tests/tools.lock
-	$(INSTALL) --no-build-isolation -e train/studies
+	$(INSTALL) --no-deps --no-build-isolation -e train/studies
 	@touch $@
 
 # The same with what builds the site; the studies draw its pages of results.

@@ -82,7 +82,6 @@ def test_nothing_is_installed_without_a_hash():
     ]
     assert [line for line in installs if "--no-deps" not in line] == [
         "$(INSTALL) --no-build-isolation -e train[stages,reports]",
-        "$(INSTALL) --no-build-isolation -e train/studies",
         next(line for line in installs if line.startswith("build/ros/bin/python")),
     ]
 
