@@ -11,7 +11,7 @@ import pytest
 
 COSTLY = {
     *("lite", "ds-cnn", "recurrent", "multirocket-hydra", "quant", "palpate", "palpate-64"),
-    *("palpate-stages", "palpate-256", "paper-cnn-centred", "tactnet2"),
+    *("palpate-stages", "palpate-256", "paper-cnn-centred", "tactnet2", "minirocket"),
     *("papillarray", "reskin", "flexitac"),
 }
 
