@@ -14,6 +14,18 @@ BROWSERS = (
     *("google-chrome", "google-chrome-stable"),
 )
 WAIT_S = 60
+SIZES = ((390, 844), (1024, 768), (1920, 1080))
+"""Widths and heights of a phone, a tablet and a screen."""
+LOOKS = pytest.mark.parametrize(
+    ("width", "height", "scheme"),
+    [
+        pytest.param(*size, scheme, marks=[pytest.mark.thorough] * (scheme == other))
+        for size, other in zip(SIZES, ("light", "dark", "light"), strict=True)
+        for scheme in ("light", "dark")
+    ],
+)
+"""Sizes and colour schemes. Colours depend on the scheme alone and places on the size alone: one
+scheme for each size finds what is wrong in either. The other pairs are thorough."""
 
 
 @contextmanager

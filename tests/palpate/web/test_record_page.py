@@ -14,14 +14,13 @@ from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 from palpate.sweeps.recording import Labels
 from palpate.web.access import Access
-from tests.factories.browser import BrowsedPage, until
+from tests.factories.browser import LOOKS, BrowsedPage, until
 from tests.factories.page_client import port
 from tests.factories.recorded_page import TAUGHT, RecordedPage
 
 pytestmark = pytest.mark.slow
 
 SECOND, JS = 1_000_000_000, "text/javascript"
-SIZES = [(390, 844), (1024, 768), (1920, 1080)]
 
 
 def begun(folder: Path, access: Access | None = None) -> RecordedPage:
@@ -195,9 +194,7 @@ def test_without_a_material_nothing_is_started(browser: Any, tmp_path: Path, tea
         context.close()
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "scheme"), [(390, 844, "light"), (1024, 768, "dark"), (1400, 900, "light")]
-)
+@LOOKS
 @pytest.mark.parametrize("teaching", [False, True], ids=["record", "teach"])
 def test_timed_sweeps_are_counted_down(browser, tmp_path, width, height, scheme, teaching):
     """In sight, in letters of 96 px or more; a skin that is away has no countdown."""
@@ -263,9 +260,7 @@ CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
 """Elements whose content is cut; the table may scroll within itself."""
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
-)
+@LOOKS
 def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
     """Contrast of 4.5 (WCAG 2.1, 1.4.3); the longest names fit."""
     recorded.recording.commands["MATERIAL"]("corrugated cardboard 2mm")
@@ -371,8 +366,7 @@ SMALL = """() => [...document.querySelectorAll("button, input")].filter((e) => e
 """Controls that a finger misses."""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@LOOKS
 @pytest.mark.parametrize("teaching", [False, True])
 def test_a_person_sees_each_control_of_a_page(
     browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
@@ -436,8 +430,7 @@ def test_a_browser_that_is_too_old_says_so(browser: Any, recorded: RecordedPage)
     context.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@LOOKS
 def test_finish_ends_the_page_in_words(
     browser: Any, tmp_path: Path, width: int, height: int, scheme: str
 ):

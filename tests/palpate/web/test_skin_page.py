@@ -12,7 +12,7 @@ from palpate.core.clock import SystemClock
 from palpate.tools.skin_monitor import LiveView
 from palpate.web.access import Access
 from palpate.web.server import PageServer
-from tests.factories.browser import BrowsedPage, contrast, until
+from tests.factories.browser import LOOKS, BrowsedPage, contrast, until
 
 pytestmark = pytest.mark.slow
 
@@ -65,11 +65,10 @@ def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser, page
     seen.page.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1024, 1920])
-def test_nothing_is_cut_off(browser, page, width, scheme):
+@LOOKS
+def test_nothing_is_cut_off(browser, page, width, height, scheme):
     """No wider than the screen; counts have a contrast of 4.5 at least (WCAG 2.1, 1.4.3)."""
-    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = BrowsedPage(context, page.address)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -11,22 +10,11 @@ import pytest
 from palpate.core.config import WatchConfig
 from palpate.web.access import Access
 from tests.factories import feed_lines
-from tests.factories.browser import BrowsedPage, until
+from tests.factories.browser import LOOKS, SIZES, BrowsedPage, until
 from tests.factories.install_scripts import page_secrets
 from tests.factories.shown_page import NOW_S, Shown, opened
 
 pytestmark = pytest.mark.slow
-
-SIZES = [(390, 844), (1024, 768), (1400, 900)]
-
-
-@pytest.fixture
-def shown() -> Iterator[Shown]:
-    """A page that shows a shift."""
-    one = Shown(Access(0))
-    with one:
-        one.shift()
-        yield one
 
 
 def test_people_read_display_names_and_programs_labels(browser, shown, tmp_path):
@@ -281,8 +269,7 @@ SHOWN = {
 """What is in sight once a view is drawn."""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), [*SIZES[:2], (1920, 1080)])
+@LOOKS
 @pytest.mark.parametrize("at", SHOWN)
 def test_every_text_can_be_read(browser, shown, width, height, scheme, at):
     """Contrast of 4.5, also with a banner and each tone; nothing too wide."""

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -17,24 +17,14 @@ import pytest
 from palpate.client.verdicts import VerdictFile
 from palpate.web.access import Access
 from tests.factories import feed_lines
-from tests.factories.browser import BrowsedPage, until
+from tests.factories.browser import LOOKS, SIZES, BrowsedPage, until
 from tests.factories.feed_lines import verdict
 from tests.factories.shown_page import NOW_S, Shown, opened
 
 pytestmark = pytest.mark.slow
 
-SIZES = [(390, 844), (1024, 768), (1920, 1080)]
 MOVED = "moved 2.2 mm too far towards row 1"
 OFF = "no palpate offers its feed there: the box is off or restarting; start it"
-
-
-@pytest.fixture
-def shown() -> Iterator[Shown]:
-    """A page that shows a shift."""
-    one = Shown(Access(0))
-    with one:
-        one.shift()
-        yield one
 
 
 def sweep(label: str = "wood", status: str = "ok", **more: Any) -> Callable[[Shown], None]:
@@ -113,8 +103,7 @@ def fits(seen: BrowsedPage, width: int, height: int) -> None:
     assert label.evaluate("e => e.scrollWidth - e.clientWidth") <= 1
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@LOOKS
 def test_each_state_is_told_from_two_metres(browser, shown, width, height, scheme):
     """By colour, shape and word, with what to do, readable."""
     size = {"width": width, "height": height}
