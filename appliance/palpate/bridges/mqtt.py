@@ -245,7 +245,7 @@ class MqttBridge:
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
         topic = f"homeassistant/device/palpate_{self._name}/config"
-        self._flying[client.publish(topic, config, qos=1, retain=True).mid] = -1
+        self._send(client, topic, config)
         client.subscribe(self._heeded)
 
     def _publish(self, client: paho.Client) -> None:
@@ -260,8 +260,8 @@ class MqttBridge:
             due = [*islice(self._waiting, at, at + max(0, self._most - len(self._flying)))]
         for one in due:
             text = json.dumps({**one.fields, "late": now_ns - one.heard_ns > LATE_NS})
-            sent = client.publish(f"{self._base}/verdict", text, qos=1, retain=True)
-            self._flying[sent.mid], self._next = one.number, one.number + 1
+            self._send(client, f"{self._base}/verdict", text, one.number)
+            self._next = one.number + 1
         self._say(client, "state", json.dumps(state(view, self.dropped)))
         if self._deaf_ns and now_ns >= self._deaf_ns:
             self._deaf_ns = 0
@@ -273,8 +273,11 @@ class MqttBridge:
         """Publish the content of a retained topic if it has changed."""
         if self._said.get(topic) != text and len(self._flying) < self._most:
             self._said[topic] = text
-            sent = client.publish(f"{self._base}/{topic}", text, qos=1, retain=True)
-            self._flying[sent.mid] = -1
+            self._send(client, f"{self._base}/{topic}", text)
+
+    def _send(self, client: paho.Client, topic: str, text: str, number: int = -1) -> None:
+        """Publish a retained message. number: of its verdict."""
+        self._flying[client.publish(topic, text, qos=1, retain=True).mid] = number
 
     def _turn(self, client: paho.Client) -> None:
         """Wait for the broker or for news, and read and write. Raises BROKEN."""

@@ -21,6 +21,7 @@ from palpate.bridges.opcua_model import (
     CODES,
     KINDS,
     METHODS,
+    OBJECTS,
     REPLY,
     RESULT,
     VARIABLES,
@@ -130,39 +131,31 @@ class OpcuaBridge:
 
     async def _add_variables(self, at: int) -> None:
         """Add the variables and the objects that hold them. at: index of the namespace."""
-        top = ua.NodeId("Palpate", at)
-        nodes = {"": await self._server.nodes.objects.add_object(top, f"{at}:Palpate")}
+        top = self._server.nodes.objects
+        nodes = {"": await top.add_object(ua.NodeId("Palpate", at), f"{at}:Palpate")}
+        for path in OBJECTS:
+            nodes[path] = await nodes[""].add_object(ua.NodeId(path, at), f"{at}:{path}")
         for path, kind in VARIABLES.items():
-            for end in [i for i, letter in enumerate(path) if letter == "."]:
-                if path[:end] not in nodes:
-                    above = nodes[path[:end].rpartition(".")[0]]
-                    name = path[:end].rpartition(".")[2]
-                    nodes[path[:end]] = await above.add_object(
-                        ua.NodeId(path[:end], at), f"{at}:{name}"
-                    )
-            above, name = nodes[path.rpartition(".")[0]], path.rpartition(".")[2]
-            add = above.add_property if name == "Number" else above.add_variable
+            above, _, name = path.rpartition(".")
+            add = nodes[above].add_property if name == "Number" else nodes[above].add_variable
             start = ua.get_default_value(kind)
             nodes[path] = await add(ua.NodeId(path, at), f"{at}:{name}", start, kind)
         self._nodes = nodes
 
     async def _add_methods(self, at: int) -> None:
-        nodes = self._nodes
-        text, date, count = (ua.ObjectIds.String, ua.ObjectIds.UtcTime, ua.ObjectIds.UInt32)
+        async def add(path: str, act: Any, takes: list[ua.Argument], *gives: ua.Argument) -> None:
+            above, _, name = path.rpartition(".")
+            ids = ua.NodeId(path, at), f"{at}:{name}"
+            await self._nodes[above].add_method(*ids, act, takes, [*gives])
+
+        text, date, count = ua.ObjectIds.String, ua.ObjectIds.UtcTime, ua.ObjectIds.UInt32
         since = [argument("Since", date), argument("Most", count)]
-        await nodes["LastResult"].add_method(
-            *(ua.NodeId("LastResult.GetResults", at), f"{at}:GetResults", self._get_results),
-            *(since, [argument("Results", text, rank=1)]),
-        )
+        found = argument("Results", text, rank=1)
+        await add("LastResult.GetResults", self._get_results, since, found)
         for method, (command, tops) in METHODS.items() if self._offer.writes else ():
-            await nodes["VisionStateMachine"].add_method(
-                *(
-                    ua.NodeId(f"VisionStateMachine.{method}", at),
-                    f"{at}:{method}",
-                    partial(self._command, command, tops),
-                ),
-                *([argument(name, ua.ObjectIds.Float) for name in tops], []),
-            )
+            takes = [argument(name, ua.ObjectIds.Float) for name in tops]
+            act = partial(self._command, command, tops)
+            await add(f"VisionStateMachine.{method}", act, takes)
         told = await self._server.create_custom_event_type(
             at, "ResultReadyEventType", properties=[*RESULT.items()]
         )

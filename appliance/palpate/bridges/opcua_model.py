@@ -20,6 +20,8 @@ STATES = {ERROR: "Error", INITIALIZED: "Initialized", READY: "Ready", EXECUTING:
 """States of the machine by their numbers in OPC 40100-1."""
 COMPLETED, ABORTED, FAILED = 1, 3, 4
 """States of a result in OPC 40100-1."""
+OBJECTS = "VisionStateMachine", "RecipeManagement", "LastResult"
+"""What holds the variables and methods."""
 STATE: Mapping[str, ua.VariantType] = {
     "VisionStateMachine.CurrentState": KINDS.LocalizedText,
     "VisionStateMachine.CurrentState.Number": KINDS.UInt32,
