@@ -168,8 +168,6 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         guard = self.create_guard_condition(self._publish_news)
 
         def heard(news: Heard | Mapping[str, Any]) -> None:
-            if self._sweeps:
-                self._sweeps.notice(news)
             self._news.append(news)
             guard.trigger()
 

@@ -31,7 +31,6 @@ class SweepAction:
         self._box, self._log = box, node.get_logger()
         self._busy = threading.Lock()
         self._ending = threading.Event()
-        self._current: CommandedSweep | None = None
         ActionServer(
             node,
             Sweep,
@@ -41,12 +40,6 @@ class SweepAction:
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
         )
-
-    def notice(self, news: object) -> None:
-        """Take news of the box."""
-        current = self._current
-        if current:
-            current.notice(news)
 
     def interrupt(self) -> None:
         """Abort the current sweep, at the box too, and wait until it has ended."""
@@ -74,7 +67,6 @@ class SweepAction:
                 goal.abort()
             return result
         finally:
-            self._current = None
             self._busy.release()
 
     def _swept(self, goal: Any) -> tuple[Answer | None, Any]:
@@ -89,10 +81,8 @@ class SweepAction:
 
         try:
             box = self._box()
-            self._current = CommandedSweep(
-                box, canceled=lambda: goal.is_cancel_requested or self._ending.is_set(), say=say
-            )
-            answer = self._current.run(goal.request)
+            canceled = lambda: goal.is_cancel_requested or self._ending.is_set()  # noqa: E731
+            answer = CommandedSweep(box.client(), canceled=canceled, say=say).run(goal.request)
         except ApplianceError as e:
             return None, Sweep.Result(message=str(e))
         names = (

@@ -17,7 +17,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from palpate.client.answers import Answer, BoxState
 from palpate.client.box import BAUD, Heard, Palpate
@@ -109,10 +109,9 @@ class LineSource:
         only. Raises ApplianceError."""
         return COMMANDS[command](self._box, **slide) or "done"
 
-    def wait_ready(self, timeout_s: float) -> None:
-        """Wait until a sweep can begin, so that every earlier sweep is answered. Raises NoAnswer or
-        CommandRefused."""
-        self._box.wait_ready(timeout_s)
+    def client(self) -> Palpate:
+        """The box, for a sweep by command."""
+        return self._box
 
     def close(self) -> None:
         self._ending.set()
@@ -126,7 +125,6 @@ class LineSource:
     def _tend(self) -> None:
         """Ask for the labels of each new bundle."""
         while not self._ending.wait(EVERY_S):
-            self._box.forget()  # nobody asks for results here
             state = self._view.state
             if state and state.bundle and state.bundle != self._named[0]:
                 with suppress(ApplianceError):  # the next time is another chance
@@ -160,15 +158,15 @@ class FeedSource:
     def view(self) -> BoxView:
         return replace(self._view, trouble=self._feed.trouble)
 
-    def send(self, command: str, **slide: float) -> str:
+    def send(self, command: str, **slide: float) -> NoReturn:
+        """Raises CommandRefused: the feed is read-only."""
+        self.client()
+
+    def client(self) -> NoReturn:
         """Raises CommandRefused: the feed is read-only."""
         raise CommandRefused(
-            f"{command}: the feed is read-only; give the bridge a serial line with --port or --link"
+            "the feed is read-only; give the bridge a serial line with --port or --link"
         )
-
-    def wait_ready(self, timeout_s: float) -> None:
-        """Raises CommandRefused: the feed is read-only."""
-        self.send("START")
 
     def close(self) -> None:
         self._ending.set()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from palpate.bridges.source import STALE_S, Source
+from palpate.bridges.source import STALE_S
 from palpate.client.answers import Answer
+from palpate.client.box import Palpate
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, LinkLost, NoAnswer
 from palpate.core.status import Status
@@ -42,22 +42,14 @@ class CommandedSweep:
 
     def __init__(
         self,
-        source: Source,
+        box: Palpate,
         *,
         canceled: Callable[[], bool],
         say: Callable[[str, Answer | None], None],
         clock: Clock | None = None,
     ) -> None:
-        self._source, self._canceled, self._say = source, canceled, say
+        self._box, self._canceled, self._say = box, canceled, say
         self._clock = clock or SystemClock()
-        self._answers: SimpleQueue[Answer] = SimpleQueue()
-        self._heard_ns = 0
-
-    def notice(self, news: object) -> None:
-        """Take news of the source; from any thread."""
-        self._heard_ns = self._clock.now_ns()
-        if isinstance(news, Answer):
-            self._answers.put(news)
 
     def run(self, terms: Terms) -> Answer:
         """The answer; it is `aborted` if the sweep was canceled.
@@ -67,21 +59,20 @@ class CommandedSweep:
         """
         check(terms)
         # so every earlier sweep is answered, and the next answer belongs to this sweep
-        self._source.wait_ready(READY_S)
+        self._box.wait_ready(READY_S)
         if self._canceled():
             raise CommandRefused("the sweep was canceled before START; send another goal")
         if terms.new_object:
-            self._source.send("NEW")
-        self._forget()
+            self._box.new_object()
         try:
-            self._source.send("START", **_slide(terms))
+            self._box.start(speed_mm_s=terms.speed_mm_s or None, force_n=terms.force_n or None)
             self._say("sliding", None)
             answer = self._answered(terms)
         except CommandRefused:  # no sweep of ours is open
             raise
         except Exception:  # after any failure, the box must not be left with an open sweep
             with suppress(ApplianceError):
-                self._source.send("ABORT")
+                self._box.abort()
             raise
         return answer or self._aborted()
 
@@ -94,23 +85,20 @@ class CommandedSweep:
         while not self._canceled():
             past_s = (self._clock.now_ns() - begin_ns) / 1e9
             if not stopped and past_s >= stop_s:
-                self._source.send("STOP")
+                self._box.stop()
                 stopped = True
                 self._say("judging", None)
-            answer = self._next(
-                min(
-                    TURN_S,
-                    max(0.0, terms.timeout_s - past_s),
-                    TURN_S if stopped else stop_s - past_s,
-                )
-            )
-            if answer:
+            turns = TURN_S, terms.timeout_s - past_s, TURN_S if stopped else stop_s - past_s
+            if answer := self._next(min(turns)):
                 if answer.early:
                     self._say("early", answer)
                 if terms.slide_s and not stopped:
                     self._close(answer)
                 return answer
-            self._check_box(begin_ns)
+            if min(past_s, self._box.silent_s()) > STALE_S:
+                raise NoAnswer(
+                    f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?"
+                )
             if past_s >= terms.timeout_s:
                 raise NoAnswer(
                     f"no answer within timeout_s = {terms.timeout_s:g} of START; the sweep was "
@@ -124,21 +112,11 @@ class CommandedSweep:
         # with NO_STOP, a START of another peer has closed it, and the STOP belongs to that peer
         if answer.status is not Status.NO_STOP:
             with suppress(ApplianceError):
-                self._source.send("STOP")
-
-    def _check_box(self, begin_ns: int) -> None:
-        """Raises LinkLost or NoAnswer once the box is gone."""
-        trouble = self._source.view().trouble
-        if trouble:
-            raise LinkLost(f"the box was lost during the sweep: {trouble}; sweep again")
-        if self._clock.now_ns() - max(begin_ns, self._heard_ns) > STALE_S * 1e9:
-            raise NoAnswer(
-                f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?"
-            )
+                self._box.stop()
 
     def _aborted(self) -> Answer:
         with suppress(CommandRefused):  # it may just have been answered
-            self._source.send("ABORT")
+            self._box.abort()
         answer = self._next(ABORTED_S)
         if answer is None:
             raise NoAnswer(
@@ -147,20 +125,13 @@ class CommandedSweep:
         return answer
 
     def _next(self, limit_s: float) -> Answer | None:
+        """The next answer, if it comes in time. Raises LinkLost."""
         try:
-            return self._answers.get(timeout=max(0.0, limit_s))
-        except Empty:
+            return self._box.result(limit_s)
+        except NoAnswer:
             return None
-
-    def _forget(self) -> None:
-        while self._next(0):
-            pass
-
-
-def _slide(terms: Terms) -> dict[str, float]:
-    """The values of START that are not 0."""
-    values = {"speed_mm_s": terms.speed_mm_s, "force_n": terms.force_n}
-    return {name: value for name, value in values.items() if value}
+        except LinkLost as e:
+            raise LinkLost(f"the box was lost during the sweep: {e}; sweep again") from e
 
 
 def check(terms: Terms) -> None:

@@ -26,7 +26,8 @@ from palpate.core.sentences import MOST_FINGERS, Sentence, sentence
 
 BAUD = 115200
 KEPT = 256
-"""Most answers that wait for `result`; then the oldest is dropped and counted as missed."""
+"""Most answers that wait for `result`; then the oldest is dropped. It counts as missed, unless a
+listener has heard it."""
 POLL_S, QUESTION_S = 0.2, 1.0
 """Time between two questions of `wait_ready`, and for the answer to a question. A box that is
 starting does not receive earlier ones."""
@@ -331,7 +332,7 @@ class Palpate:
     def _keep(self, answer: Answer) -> None:
         if len(self._answers) >= KEPT:
             self._answers.popleft()
-            self.missed += 1
+            self.missed += self._listener is None
         self._answers.append(answer)
 
 

@@ -14,7 +14,6 @@ from palpate.bridges import sweep
 from palpate.bridges.source import FeedSource, LineSource
 from palpate.bridges.sweep import CommandedSweep
 from palpate.client.answers import Answer
-from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, LinkLost, NoAnswer
 from palpate.core.sentences import Sentence, sentence
 from palpate.core.status import Status
@@ -34,18 +33,6 @@ class Wanted(NamedTuple):
     force_n: float = 0.0
 
 
-class Hurried(SystemClock):
-    """A clock that advances by a second with each reading."""
-
-    def __init__(self) -> None:
-        self._looks = 0
-
-    def now_ns(self) -> int:
-        """The time now."""
-        self._looks += 1
-        return self._looks * 10**9
-
-
 class Swept:
     """A box, a source that hears it, and a sweep that can be canceled."""
 
@@ -54,13 +41,9 @@ class Swept:
         self.phases: list[str] = []
         self.canceled = threading.Event()
         self.at_phase: Callable[[str], object] = lambda phase: None
-        self.source = LineSource(str(path), heard=lambda news: self.sweep.notice(news))
-        self.use(SystemClock())
-
-    def use(self, clock: SystemClock) -> None:
-        """Another sweep, with this clock."""
+        self.source = LineSource(str(path))
         self.sweep = CommandedSweep(
-            self.source, canceled=self.canceled.is_set, say=self._say, clock=clock
+            self.source.client(), canceled=self.canceled.is_set, say=self._say
         )
 
     def run(self, **terms: float | bool) -> Answer:
@@ -182,7 +165,8 @@ def test_a_sweep_has_its_own_goal_and_answer(swept):
     started = [s.fields for s in swept.box.heard if s.kind == "START"]
     assert started == [["30.5"], ["", "1.5"], []]
     swept.box.script = saying()
-    swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
+    swept.box.say(result(6))
+    eventually(lambda: swept.source.view().answer.sweep == 6)
     with pytest.raises(NoAnswer):
         swept.run(timeout_s=0.3)
 
@@ -213,21 +197,20 @@ def test_an_error_of_the_caller_leaves_no_sweep_open(swept):
     assert swept.has_heard("START", "ABORT")
 
 
-def test_a_box_that_falls_silent(swept):
-    """After 3.5 s without a sentence, anew with each; then the time limit ends the wait."""
-    swept.use(Hurried())
+def test_a_box_that_falls_silent(swept, monkeypatch):
+    """After some seconds without a sentence, anew with each; then the time limit ends the wait."""
+    monkeypatch.setattr(sweep, "STALE_S", 0.2)
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match=r"3\.5 s"):
-        swept.run(slide_s=0.0, timeout_s=1000.0)
+    with pytest.raises(NoAnswer, match=r"0\.2 s"):
+        swept.run(slide_s=0.0)
     assert swept.has_heard("START", "ABORT")
     spoken = CommandedSweep(
-        swept.source,
-        canceled=lambda: bool(spoken.notice(state())),
+        swept.source.client(),
+        canceled=lambda: bool(swept.box.say(state())),
         say=lambda phase, answer: None,
-        clock=Hurried(),
     )
-    with pytest.raises(NoAnswer, match="timeout_s = 20"):
-        spoken.run(Wanted(slide_s=0.0, timeout_s=20.0))
+    with pytest.raises(NoAnswer, match=r"timeout_s = 0\.6"):
+        spoken.run(Wanted(slide_s=0.0, timeout_s=0.6))
 
 
 def test_a_box_that_refuses_or_is_not_ready(swept, monkeypatch):
@@ -249,7 +232,7 @@ def test_the_feed_begins_nothing(tmp_path):
     """It is read-only, and the error names it."""
     source = FeedSource(str(tmp_path / "feed.sock"))
     with pytest.raises(CommandRefused, match="read-only"):
-        CommandedSweep(source, canceled=lambda: False, say=lambda phase, answer: None).run(Wanted())
+        source.client()
     source.close()
 
 
