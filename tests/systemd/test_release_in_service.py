@@ -66,7 +66,7 @@ def test_a_release_that_works_stays(releases: Machine, service: Service):
         releases.get("systemctl", "stop", "palpate")
     assert release(releases) == NEW
     held = json.loads(releases.get("cat", "/opt/palpate.trial"))
-    assert (held["start"], held["starts"]) == (4, 1)
+    assert (held["start"], held["standing"]["starts"]) == (4, 1)
 
 
 @pytest.mark.parametrize("what", BROKEN)

@@ -21,7 +21,7 @@ from palpate.core.log import log
 from palpate.core.observer import Observer
 from palpate.core.status import Status
 from palpate.deployment import releases
-from palpate.deployment.state import Goal, Standing
+from palpate.deployment.state import Goal
 from palpate.deployment.trial import Trial
 
 if TYPE_CHECKING:
@@ -162,12 +162,10 @@ def observed(environ: Mapping[str, str] = os.environ) -> ReleaseTrial | None:
     before = releases.read_report(folder, trial)
     if before.passed:
         return None
-    sweeps, s = trial.sweeps, trial.streamed_s
-    begun = replace(
-        before, start=trial.start, quiet=False, worked=False, sweeps=sweeps, streamed_s=s
-    )
-    standing = Standing(sweeps=sweeps, streamed_s=s)
+    held = trial.standing
+    progress = held.sweeps, held.streamed_s
+    begun = releases.ReleaseReport(trial.id, trial.start, False, *progress, why=before.why)
     store = ReportStore(folder, begun)
-    made = ReleaseTrial(store, trial.release, f"release {trial.release}", standing)
+    made = ReleaseTrial(store, trial.release, f"release {trial.release}", held)
     made.proven = str(Path(sys.prefix).resolve().parent / trial.back / "bin" / "python")
     return made

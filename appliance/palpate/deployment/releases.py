@@ -23,7 +23,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from palpate.core import storage
@@ -54,18 +54,13 @@ the release that runs now."""
 @dataclass(frozen=True, slots=True)
 class RootState:
     """Root's part of a trial. release: the folder's name. back: the release to go back to. id: of
-    this trial. start: the number of starts. starts, boot, cuts, sweeps, streamed_s: as in
-    Standing."""
+    this trial. start: the number of all starts. standing: with the last start, as of its begin."""
 
     release: str
     back: str
     id: str
     start: int = 0
-    starts: int = 0
-    boot: str = ""
-    cuts: int = 0
-    sweeps: int = 0
-    streamed_s: float = 0.0
+    standing: Standing = field(default_factory=Standing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,30 +169,19 @@ class Releases:
         elif why := why or _wrong(held):
             return self._send_back(trial, why)
         else:
-            begun = replace(
-                trial,
-                start=trial.start + 1,
-                starts=held.starts + 1,
-                boot=boot,
-                cuts=held.cuts,
-                sweeps=held.sweeps,
-                streamed_s=held.streamed_s,
-            )
+            counted = replace(held, starts=held.starts + 1, boot=boot, worked=False)
+            begun = replace(trial, start=trial.start + 1, standing=counted)
             storage.put(self._counts, _json(asdict(begun)), mode=0o644)
         return ""
 
     def _judged(self, trial: RootState, report: ReleaseReport, boot: str) -> Standing:
         """The state before a start, once the last start has been judged by its report."""
-        mine, quiet = report.start == trial.start, report.quiet and trial.start > 0
-        held = Standing(
-            *(trial.back, 0, False, trial.starts, trial.sweeps, trial.streamed_s),
-            boot=trial.boot,
-            cuts=trial.cuts,
-        )
-        if mine:
-            starts = max(0, trial.starts - quiet)
+        held = trial.standing
+        if report.start == trial.start:
+            quiet = report.quiet and trial.start > 0
+            starts = max(0, held.starts - quiet)
             now = TrialProgress(starts, report.sweeps, report.streamed_s, report.worked)
-            held = held.noted(now, "" if quiet else trial.boot)
+            held = held.noted(now, "" if quiet else held.boot)
         return held.since(boot)
 
     def _send_back(self, trial: RootState, why: str) -> str:

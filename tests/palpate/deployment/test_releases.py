@@ -264,7 +264,7 @@ def test_what_another_puts_in_place_of_the_report_counts_for_nothing(
         file.mkdir()
     assert (box.releases.begin(), box.runs) == ("", NEW)
     assert box.releases.trial
-    assert box.releases.trial.starts == 2
+    assert box.releases.trial.standing.starts == 2
 
 
 def test_a_report_of_an_earlier_trial_counts_for_nothing(box: TrialBox):
