@@ -34,22 +34,22 @@ def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
     return x, labels, at
 
 
-def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
+def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, places: int = 3) -> Case:
     """A training on eight positions and a test on others."""
     x, y, at = world(8, 20, 1, apart)
     keep = y != left_out
     y = y - (y > left_out) * (left_out != NONE_LEFT_OUT)
-    new, labels, there = world(places, 24, 2 + fold, apart, first=100 + 10 * fold)
+    new, labels, there = world(places, 24, 2, apart, first=100)
     x, y, at = x[keep], y[keep], at[keep]
     seen = at % 2 == 1
     copied = x[:, -1] + np.random.default_rng(9).normal(0, 0.1, (len(x), 4))
     known = x, y, at[None], ~seen, True, copied, y, np.arange(len(y)), ~seen
-    return Case(left_out, fold, 2, *known, new, labels, there, np.zeros(len(y), bool))
+    return Case(left_out, 2, *known, new, labels, there, np.zeros(len(y), bool))
 
 
 @pytest.fixture(scope="module")
 def figures():
-    """All figures of one fold, with each material left out once."""
+    """All figures, with each material left out once."""
     held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
     return json.loads(json.dumps(certainty.figures(held, NAMES)))
 
@@ -73,7 +73,7 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
     one = replace(one, seen=one.seen + shift[one.seen_groups[0]], new=one.new + shift[one.places])
     done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups[0], one.held))
-    figures = certainty.calibration([(one, done)])
+    figures = certainty.calibration(one, done)
     right = figures["accuracy"]["accuracy"]
     mean = {}
     for when in ("before", "after"):
@@ -161,30 +161,34 @@ def sweeps(materials: int = 3) -> Dataset:
     return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
 
 
+def split(hums: Dataset, first: int = 3) -> tuple[Dataset, Dataset]:
+    """The sweeps of the `first` positions, and the others."""
+    seen = hums.groups["position"] < first
+    return hums.take(seen), hums.take(~seen)
+
+
 @pytest.mark.thorough  # a whole study
 def test_from_set_to_page_and_again_from_the_cache(tmp_path):
     """A study with a few iterations makes results and a page. A second run trains nothing."""
-    hums, lines = sweeps(), []
+    halves, lines = split(sweeps()), []
     where = Where(jobs=1, cache=tmp_path / "cache")
     given = "palpate-pairs", where, lines.append, Effort(0.02)
-    first = certainty.run(hums, None, "split:position=0,1,2->3", *given)
+    first = certainty.run(*halves, *given)
     assert first["trainings"] == 4
     assert "4/4 done" in lines[-2]
     assert sorted(uncertainty_report.render(first)[1]) == ["reliability"]
     kept = "palpate-pairs", replace(where, kept=True), lines.append, Effort(0.02)
-    again = certainty.run(hums, None, "split:position=0,1,2->3", *kept)
+    again = certainty.run(*halves, *kept)
     assert again | {"took_s": 0} == first | {"took_s": 0}
     with pytest.raises(FormatError, match="4 of 4"):
-        certainty.run(hums, None, "split:position=0,1->2", *kept)
+        certainty.run(*split(sweeps(), 2), *kept)
 
 
 def test_methods_without_tenths_are_refused():
     """L-gauss has no trunk. The error says so."""
     where = Where(jobs=1, cache=None)
     with pytest.raises(FormatError, match="L-gauss"):
-        certainty.run(
-            sweeps(), None, "split:position=0,1,2->3", "L-gauss", where, print, Effort(0.02)
-        )
+        certainty.run(*split(sweeps()), "L-gauss", where, print, Effort(0.02))
 
 
 def test_a_case_lost_on_the_way_is_trained_again(tmp_path):

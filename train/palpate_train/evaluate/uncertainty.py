@@ -19,7 +19,7 @@ from palpate_train.answer.calibrate import Calibration
 from palpate_train.answer.embedding import auroc
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case, Log, Trainings, cases
+from palpate_train.evaluate.uncertainty_cases import Case, CaseTask, Log, cases, train_and_test
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
 
@@ -48,11 +48,10 @@ def left_out(
     Raises FormatError if the sets do not fit together, or if the method has no features to judge
     novelty by.
     """
-    plan = Trainings.of(train, test, "", SEED)
-    wanted = [t for t in plan.tasks(method, effort, SEED) if t.left_out == NONE_LEFT_OUT]
-    (whole,) = cases(wanted, plan.sweeps, where, log)
-    without = map(whole.without, range(len(plan.sweeps.materials)))
-    return unknown([(case, case.calibration()) for case in without], plan.sweeps.materials)
+    both, seen, new = train_and_test(train, test)
+    (whole,) = cases([CaseTask(method, effort, SEED, seen, new)], both, where, log)
+    without = map(whole.without, range(len(both.materials)))
+    return unknown([(case, case.calibration()) for case in without], both.materials)
 
 
 def error(confidence: Array, right: Array) -> float:
@@ -86,14 +85,9 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
     below the limit found in training, and of unknown sweeps that pass as known.
     """
     found: dict[str, Json] = {}
-    for k in sorted({case.left_out for case, _ in without}):
-        held = [one for one in without if one[0].left_out == k]
-        known = np.concatenate([case.known() for case, _ in held])
-        # in units of the limit, because the limits of folds differ
-        scores = [
-            done.embedding.novelty(case.new[:, -1]) / done.limits.balanced for case, done in held
-        ]
-        found[materials[k]] = _detection(np.concatenate(scores), known, placements(held))
+    for case, done in without:
+        scores = done.embedding.novelty(case.new[:, -1]) / done.limits.balanced
+        found[materials[case.left_out]] = _detection(scores, case.known(), case.places)
     mean = {
         name: round(float(np.mean([row[name] for row in found.values()])), 4)
         for name in ("auroc", "kept", "false_known", "false_known_at_95")
@@ -119,16 +113,6 @@ def _detection(scores: Array, known: Array, places: Array) -> Json:
 
 def _auroc_of(scores: Array, known: Array, some: Array) -> float:
     return auroc(scores[some][known[some]], scores[some][~known[some]])
-
-
-def joined(held: Sequence[Trained], name: str) -> Array:
-    return np.concatenate([getattr(case, name) for case, _ in held])
-
-
-def placements(held: Sequence[Trained]) -> Array:
-    """The placement of the skin in each test sweep, numbered from 0."""
-    places: Array = np.unique(joined(held, "places"), return_inverse=True)[1]
-    return places
 
 
 def bootstrap(figure: Callable[[Array], float], clusters: Array) -> tuple[float, float]:

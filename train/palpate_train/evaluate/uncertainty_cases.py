@@ -24,7 +24,6 @@ from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_c
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
 from palpate_train.data.sets import Dataset, digest, join
-from palpate_train.data.splitters import Protocol
 from palpate_train.evaluate import parallel
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.evaluate.fold import fingerprint
@@ -46,7 +45,6 @@ class CaseTask:
     method: str
     effort: Effort
     seed: int
-    fold: int
     train: Array
     test: Array
     left_out: int = NONE_LEFT_OUT
@@ -68,7 +66,6 @@ class Case:
     """
 
     left_out: int
-    fold: int
     fixed: int
     seen: Array
     seen_labels: Array
@@ -162,7 +159,6 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(
         task.left_out,
-        task.fold,
         given.fixed,
         given.prefixes,
         given.labels,
@@ -181,35 +177,12 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Trainings:
-    """The sweeps of a study and its folds, pairs (training, test) of sweep numbers."""
-
-    sweeps: Dataset
-    protocol: str
-    folds: Sequence[tuple[Array, Array]]
-
-    @classmethod
-    def of(cls, train: Dataset, test: Dataset | None, protocol: str, seed: int) -> Trainings:
-        """Train on one set and test on another; without `test`, divide `train` by the protocol.
-
-        Raises FormatError if the sets or the protocol do not fit.
-        """
-        if test is not None:
-            train = join([train.require_materials(), test])
-            protocol = "split:set=0->1"
-        return cls(train, protocol, Protocol(protocol).folds(train, seed))
-
-    def tasks(self, method: str, effort: Effort, seed: int) -> list[CaseTask]:
-        """Every fold with all materials, and without each of them if at least two remain."""
-        out = [NONE_LEFT_OUT]
-        if len(self.sweeps.materials) > 2:
-            out += range(len(self.sweeps.materials))
-        return [
-            CaseTask(method, effort, seed, i, *fold, left)
-            for left in out
-            for i, fold in enumerate(self.folds)
-        ]
+def train_and_test(train: Dataset, test: Dataset) -> tuple[Dataset, Array, Array]:
+    """Both sets as one, and the numbers of the sweeps of each. Raises FormatError if they do not
+    fit together."""
+    both = join([train.require_materials(), test])
+    numbers = np.arange(len(both))
+    return both, numbers[: len(train)], numbers[len(train) :]
 
 
 def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -> list[Case]:
@@ -226,7 +199,7 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
     ]
     for i, key in enumerate(keys):
         if where.cache and (case := _load(where.cache / f"{key}.case.npz")):
-            done[i] = replace(case, fold=wanted[i].fold)
+            done[i] = case
     left = [(i, task) for i, task in enumerate(wanted) if i not in done]
     if left and where.kept:
         raise FormatError(
@@ -237,10 +210,8 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
         done[i] = case
         if where.cache:
             _save(case, where.cache / f"{keys[i]}.case.npz")
-        out = (
-            "" if task.left_out == NONE_LEFT_OUT else f" without {sweeps.materials[task.left_out]}"
-        )
-        progress(f"{task.method}, fold {task.fold + 1}{out}")
+        out = "" if task.left_out < 0 else f" without {sweeps.materials[task.left_out]}"
+        progress(f"{task.method}{out}")
     return [done[i] for i in range(len(wanted))]
 
 

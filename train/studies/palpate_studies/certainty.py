@@ -15,12 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
+from palpate_train.answer.calibrate import Calibration
 from palpate_train.answer.fit_early import decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.uncertainty import Trained
-from palpate_train.evaluate.uncertainty_cases import Case, Log, Trainings, cases
+from palpate_train.evaluate.uncertainty_cases import (
+    NONE_LEFT_OUT,
+    Case,
+    CaseTask,
+    Log,
+    cases,
+    train_and_test,
+)
 from palpate_train.metrics.score import interval, provenance
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
@@ -30,84 +37,68 @@ Json = dict[str, Any]
 
 
 def run(
-    sweeps: Dataset,
-    test: Dataset | None,
-    protocol: str,
+    train: Dataset,
+    test: Dataset,
     method: str,
     where: Where,
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
     seed: int = 1,
 ) -> dict[str, Any]:
-    """All figures for the results. test: the set to test on; without it, `protocol` selects the
-    held-out sweeps.
+    """All figures for the results, of trainings on all materials, and on all but each if at least
+    two remain.
 
     Raises FormatError if the sets do not fit together, or if the method gives no such figures.
     """
     start = time.monotonic()
-    plan = Trainings.of(sweeps, test, protocol, seed)
-    whole_set = plan.sweeps
-    trained = cases(plan.tasks(method, effort, seed), whole_set, where, log)
+    both, seen, new = train_and_test(train, test)
+    out = range(len(both.materials)) if len(both.materials) > 2 else ()
+    wanted = [CaseTask(method, effort, seed, seen, new, left) for left in (NONE_LEFT_OUT, *out)]
+    trained = cases(wanted, both, where, log)
     log("figures")
-    result = figures(trained, whole_set.materials)
+    result = figures(trained, both.materials)
     about = {
-        "set": sweeps.source,
-        "test": test.source if test else "",
-        "protocol": "train and test" if test else protocol,
+        "set": train.source,
+        "test": test.source,
         "method": method,
         "effort": effort.share,
         "seed": seed,
-        "folds": len(plan.folds),
         "trainings": len(trained),
-        "sweeps": len(whole_set),
-        "tested": int(sum(len(test) for _, test in plan.folds)),
-        "digest": digest(whole_set),
-        "materials": list(whole_set.materials),
-        "format": str(whole_set.format),
+        "sweeps": len(both),
+        "tested": len(test),
+        "digest": digest(both),
+        "materials": list(both.materials),
+        "format": str(both.format),
         "took_s": round(time.monotonic() - start, 1),
     }
     return about | provenance() | result
 
 
 def figures(trained: Sequence[Case], materials: Sequence[str]) -> Json:
-    """All figures. With two materials there are none that need a material left out."""
-    fitted = [(case, case.calibration()) for case in trained]
-    full = [one for one in fitted if one[0].left_out < 0]
-    result = {
-        "calibration": calibration(full),
-        "early": early(full),
-    }
-    without = [one for one in fitted if one[0].left_out >= 0]
+    """All figures. trained: first on all materials, then without each; with two materials none is
+    left out."""
+    full, *without = [(case, case.calibration()) for case in trained]
+    result = {"calibration": calibration(*full), "early": early(*full)}
     if without:
         result["unknown"] = uncertainty.unknown(without, materials)
     return result
 
 
-def calibration(full: Sequence[Trained]) -> Json:
+def calibration(case: Case, done: Calibration) -> Json:
     """Expected calibration error and reliability before the temperature (LDA's own posteriors) and
     after."""
-    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
-    result: Json = {
-        "n": len(labels),
-        "temperature": [round(done.temperature, 2) for _, done in full],
-    }
-    for name, undo in (("before", True), ("after", False)):
-        logits = np.concatenate(
-            [
-                done.logits(case.new[:, -1]) * (done.temperature if undo else 1)
-                for case, done in full
-            ]
-        )
-        p = softmax(logits)
-        confidence, right = p.max(1), p.argmax(1) == labels
-        low, high = uncertainty.bootstrap(partial(_error_of, confidence, right), places)
+    result: Json = {"n": len(case.labels), "temperature": [round(done.temperature, 2)]}
+    for name, undo in (("before", done.temperature), ("after", 1)):
+        p = softmax(done.logits(case.new[:, -1]) * undo)
+        confidence, right = p.max(1), p.argmax(1) == case.labels
+        low, high = uncertainty.bootstrap(partial(_error_of, confidence, right), case.places)
         result[name] = {
             "error": round(uncertainty.error(confidence, right), 4),
             "low": low,
             "high": high,
             "bins": uncertainty.reliability(confidence, right),
         }
-    result["accuracy"] = _accuracy(right, places)
+    result["accuracy"] = _accuracy(right, case.places)
     return result
 
 
@@ -115,29 +106,21 @@ def _error_of(confidence: Array, right: Array, some: Array) -> float:
     return uncertainty.error(confidence[some], right[some])
 
 
-def early(full: Sequence[Trained]) -> Json:
-    """Accuracy and mean share of the sweep for the rules found in training, for other rules, and
-    for an answer after the first tenth."""
-    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
-    p = np.concatenate([done.probabilities(case.new) for case, done in full])
+def early(case: Case, done: Calibration) -> Json:
+    """Accuracy and mean share of the sweep for the rule found in training, and for an answer after
+    each tenth."""
+    labels, places, found = case.labels, case.places, done.rule
+    p = done.probabilities(case.new)
     whole = p[:, -1].argmax(1) == labels
-    steps = p.shape[1]
-    by_rule = [
-        decide(p_, done.rule.early) if done.rule.early else (p_[:, -1].argmax(1), np.ones(len(p_)))
-        for (_, done), p_ in zip(full, _parted(p, full), strict=True)
-    ]
-    named, share = (np.concatenate(part) for part in zip(*by_rule, strict=True))
+    named, share = decide(p, found.early) if found.early else (p[:, -1].argmax(1), np.ones(len(p)))
     lost = whole.astype(float) - (named == labels)
     low, high = uncertainty.bootstrap(partial(_mean_of, lost), places)
-    rules = [
-        {
-            "least": r.early.least[0] if r.early else None,
-            "agree": r.early.agree if r.early else None,
-            "why": r.why,
-            "n": r.n,
-        }
-        for r in (done.rule for _, done in full)
-    ]
+    rule = {
+        "least": found.early.least[0] if found.early else None,
+        "agree": found.early.agree if found.early else None,
+        "why": found.why,
+        "n": found.n,
+    }
     return {
         "share": round(float(share.mean()), 4),
         "lost": round(float(lost.mean()), 4),
@@ -145,14 +128,9 @@ def early(full: Sequence[Trained]) -> Json:
         "lost_high": high,
         "rule": _accuracy(named == labels, places),
         "whole": _accuracy(whole, places),
-        "rules": rules,
-        "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)],
+        "rules": [rule],
+        "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(p.shape[1])],
     }
-
-
-def _parted(rows: Array, held: Sequence[Trained]) -> list[Array]:
-    """`rows` of all cases, split by case."""
-    return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
 
 
 def _accuracy(right: Array, clusters: Array) -> Json:

@@ -105,8 +105,8 @@ def measured(
 def of_panels(
     names: Sequence[str], data: Path | None, seed: int, cache: Path | None, log: Log, effort: Effort
 ) -> Json:
-    """`measured` for each panel of the chart, with what the chart shows of each method. Panels of
-    real sweeps need the folder `data`."""
+    """`measured` for each panel of the chart, with the keys CHARTED alone. Panels of real sweeps
+    need the folder `data`."""
     found = {}
     for kind, case in PANELS.items():
         if (sweeps := case.load(data)) is not None:

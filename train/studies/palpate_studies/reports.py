@@ -75,15 +75,7 @@ FABRICS_STRESSED = (
 REPORTS = (
     _study("development", needs=(REAL,)),
     _study("alignment", folds=False),
-    _study(
-        "certainty",
-        "--method",
-        "palpate-reattached",
-        "--set",
-        "sim:T-REAL/level-blind:1-3",
-        "--test",
-        "sim:T-REAL/level-blind:4-6:20",
-    ),
+    _study("certainty"),
     _study("fabrics", needs=(REAL,)),
     _study("recipe", needs=(REAL,), folds=False),
     ResultFile(

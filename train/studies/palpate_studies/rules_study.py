@@ -45,8 +45,8 @@ MODULES = {
 def results(
     bundle: Bundle, tested: Dataset, moved: Dataset, each: int, log: Callable[[str], None]
 ) -> Json:
-    """The answers with all rules, and without each; see `rows`. moved: slides at other places, each
-    of which counts as displaced."""
+    """The answers with all rules, and without each; see `rows`. moved: slides at other places;
+    each counts as displaced."""
     given = list(trial.sweeps_for(tested, bundle, 1, each))
     given.append(trial.Given(moved, trial.DISPLACED))
     return {

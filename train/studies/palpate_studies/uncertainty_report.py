@@ -6,7 +6,7 @@ run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from palpate_studies import TEMPLATES
@@ -18,11 +18,9 @@ Json = Mapping[str, Any]
 ORIGIN = {
     "set": "trained on",
     "test": "tested on",
-    "protocol": "protocol",
     "method": "method",
     "seed": "seed",
     "effort": "share of the usual training",
-    "folds": "folds",
     "trainings": "trainings",
     "sweeps": "sweeps in all",
     "tested": "sweeps tested",
@@ -39,7 +37,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
     """The page (HTML) and its pictures (SVG) by name."""
     after = figures["calibration"]["after"] | {"n": figures["calibration"]["n"]}
     pictures = {"reliability": bundle_report.calibration(after)}
-    heat, rules = figures["calibration"]["temperature"], figures["early"]["rules"]
+    (heat,), (rule,) = figures["calibration"]["temperature"], figures["early"]["rules"]
     page = html.render(
         "uncertainty.html.j2",
         TEMPLATES,
@@ -50,9 +48,8 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         tables=_tables(figures),
         worst=_worst(figures),
-        temperature=" to ".join(dict.fromkeys(f"{t:.1f}" for t in (min(heat), max(heat)))),
-        rules=_distinct(rule for rule in rules if not rule["why"]),
-        off=[rule["why"] for rule in rules if rule["why"]],
+        temperature=f"{heat:.1f}",
+        rule=rule,
         kept=KEPT,
         simulated=str(figures["set"]).startswith("sim:"),
         origin=[[text, figures[name]] for name, text in ORIGIN.items() if figures[name] != ""],
@@ -100,9 +97,3 @@ def _unknown_tables(figures: Json) -> dict[str, list[list[str]]]:
 def _share(of: Json, name: str) -> str:
     """A share with its interval."""
     return formatting.estimate([of[name], of["low"], of["high"]])
-
-
-def _distinct(rules: Iterable[Json]) -> list[Json]:
-    """Each rule once, by rising probability."""
-    pairs = sorted({(rule["least"], rule["agree"]) for rule in rules})
-    return [{"least": least, "agree": agree} for least, agree in pairs]

@@ -24,7 +24,7 @@ from palpate_studies import (
     stress,
 )
 from palpate_studies.study import add_out, save
-from palpate_train.arguments import numbers, options
+from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
 from palpate_train.data.corruptions import applicable
@@ -35,12 +35,13 @@ from palpate_train.data.sets import Dataset
 from palpate_train.export import bundle_stress
 from palpate_train.export.quantized_bundle import export
 from palpate_train.metrics import score
-from palpate_train.models import methods
-from palpate_train.models.methods import Log
+from palpate_train.models.methods import PACKAGED, Log
 from palpate_train.models.recipe import recipe
 
 STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+CERTAIN = "sim:T-REAL/level-blind:1-3", "sim:T-REAL/level-blind:4-6:20"
+"""What is trained on and tested on in the study `certainty`."""
 MOVED, EACH = "sim:T-HARD/level-blind:101-112:2", 48
 """Slides at places that are displaced, and the number of sweeps of each alteration and each kind of
 junk, for the study `rules`."""
@@ -105,22 +106,6 @@ def _add_corrupted(command: argparse.ArgumentParser) -> None:
 
 def _add_certainty(add: Add) -> None:
     command = add("certainty", run_certainty)
-    options.add_set(command)
-    command.add_argument("--test", metavar="SET", help="test on this set")
-    command.add_argument(
-        "--protocol",
-        default="leave:position",
-        help="what is tested on where --test is not given (leave:position)",
-    )
-    command.add_argument(
-        "--method",
-        default=methods.SHIPPED,
-        metavar="NAME",
-        help=f"{methods.SHIPPED} or one of its sizes ({methods.SHIPPED})",
-    )
-    command.add_argument(
-        "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
-    )
     add_out(command, "certainty")
     options.add_effort(command)
     options.add_where(command)
@@ -200,17 +185,9 @@ def _box_under_stress(
 
 def run_certainty(args: argparse.Namespace) -> None:
     """Write the results; print their path."""
-    test = sets.load(args.test).select(args.only) if args.test else None
-    result = certainty.run(
-        options.load(args),
-        test,
-        args.protocol,
-        args.method,
-        options.where(args),
-        options.Log(),
-        options.effort(args),
-        args.seed,
-    )
+    train, test = map(sets.load, CERTAIN)
+    where, effort = options.where(args), options.effort(args)
+    result = certainty.run(train, test, PACKAGED, where, options.Log(), effort)
     print(save(args.out, result))
 
 
