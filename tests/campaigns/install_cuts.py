@@ -38,8 +38,10 @@ DROP_IN = "/etc/systemd/system/palpate.service.d/test.conf"
 LINKS = "/opt/palpate", "/var/lib/palpate/current"
 """They lead to the release and to the bundle."""
 APT = "DEBIAN_FRONTEND=noninteractive apt-get -y -q install --reinstall /parcel/palpate.deb"
-FIRST = re.compile(r"(sweep 1: [^(]*).*")
-"""The first answer, without the time that it took."""
+ANSWER = re.compile(r"(sweep \d+: (?!no answer, gap)[^(]*).*")
+"""A line of the journal, with the answer but without the time that it took. A busy machine loses
+frames of the simulated skin; such a sweep says nothing."""
+AND = "; "
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +153,12 @@ class CutHost:
             host.machine.cut()
             process.kill()
             process.communicate()
-            again = self._again(upper.parent, before)
+            again = self._again(upper.parent, before, 1 if of_s else 3)
             found = InstallCut(command, round(at_s, 2), round(of_s or at_s, 2), *again)
         shutil.rmtree(upper.parent, ignore_errors=True)
         return found
 
-    def _again(self, work: Path, before: str) -> tuple[float, float, str, bool, str]:
+    def _again(self, work: Path, before: str, answers: int) -> tuple[float, float, str, bool, str]:
         """Boot a host that was cut: the rest of an InstallCut."""
         begin = time.monotonic()
         with nspawn.Machine(
@@ -165,7 +167,7 @@ class CutHost:
             service = nspawn.Service(machine)
             service.until("ActiveState", "active")
             ready_s = int(service["ActiveEnterTimestampMonotonic"]) / 1e6 - begin
-            answer, answered_s = _first_answer(machine)
+            answer, answered_s = _answers(machine, answers)
             answer_s = answered_s - begin
             after = machine.run("readlink", *LINKS).stdout
             rejected = machine.run("cat", "/opt/palpate.rejected").stdout
@@ -175,15 +177,16 @@ class CutHost:
         return *times, answer, after != before, "; ".join(wrong)
 
 
-def _first_answer(machine: nspawn.Machine) -> tuple[str, float]:
-    """The first line of a sweep in the journal, and its time in s. Raises AssertionError."""
+def _answers(machine: nspawn.Machine, count: int) -> tuple[str, float]:
+    """The first answers in the journal, and the time of the first in s. Raises AssertionError."""
     end_s = time.monotonic() + LONGEST_S
     journal = ("journalctl", "-q", "-b", "-u", "palpate", "-o", "json")
     while time.monotonic() < end_s:
-        for line in machine.get(*journal).splitlines():
-            entry = json.loads(line)
-            if found := FIRST.fullmatch(str(entry["MESSAGE"])):
-                return found[1].strip(), int(entry["__MONOTONIC_TIMESTAMP"]) / 1e6
+        lines = [json.loads(line) for line in machine.get(*journal).splitlines()]
+        found = [(line, it) for line in lines if (it := ANSWER.fullmatch(str(line["MESSAGE"])))]
+        if len(found) >= count:
+            texts = [it[1].strip() for _, it in found[:count]]
+            return AND.join(texts), int(found[0][0]["__MONOTONIC_TIMESTAMP"]) / 1e6
         time.sleep(0.2)
     raise AssertionError("no sweep is answered")
 
@@ -197,7 +200,7 @@ def cuts(host: CutHost, commands: Sequence[str], times: int, seed: int) -> Itera
         yield whole
         for _ in range(times):
             one = host.cut(command, whole.at_s, rng.random())
-            if one.answer != whole.answer:
+            if one.answer not in whole.answer.split(AND):
                 other = f"{one.wrong}; another answer than {whole.answer!r}".lstrip("; ")
                 one = InstallCut(**(asdict(one) | {"wrong": other}))
             yield one

@@ -33,6 +33,12 @@ OK = Verdict(
 )
 
 
+def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
+    """Health of the box at this time."""
+    at_ns = round(time_s * SECOND)
+    return HEALTH._replace(time_ns=at_ns, streams=streams, sweeping=sweeping)
+
+
 def frames(n: int = 6, format: SweepFormat = skin.FORMAT, first: int = 0) -> Frames:
     """Numbered frames."""
     at = np.arange(first, first + n)

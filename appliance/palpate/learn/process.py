@@ -92,18 +92,14 @@ class TeachingProcess:
         if self.ended:
             return []
         found = self._read()
-        self._told = self._told or any(one["type"] != "step" for one in found)
-        code = self._process.poll()
-        if code is None and not (why := self._overdue(bool(found))):
-            return found
-        if code is None:
-            self.close()
+        if (code := self._process.poll()) is None:
+            why = self._overdue(bool(found))
         else:
-            found += self._read()
-            self._told = self._told or any(one["type"] != "step" for one in found)
-            why = _why(code)
+            found, why = [*found, *self._read()], _why(code)
+        self._told = self._told or any(one["type"] != "step" for one in found)
+        if why:
             self.close()
-        return found if self._told else [*found, {"type": "error", "text": why}]
+        return [*found, {"type": "error", "text": why}] if why and not self._told else found
 
     def _overdue(self, heard: bool) -> str:
         """Why the running process must end, "" if it may go on."""

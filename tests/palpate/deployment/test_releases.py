@@ -14,22 +14,15 @@ import pytest
 from palpate.bundle.bundle import DEFAULT
 from palpate.cli.main import main
 from palpate.core.errors import ConfigError
-from palpate.core.health import Health
 from palpate.core.types import Status, Verdict
 from palpate.deployment import release_trial, releases
 from palpate.deployment.release_trial import ReleaseTrial
 from palpate.deployment.releases import Releases
 from palpate.sim import skin
 from palpate.sweeps.black_box import BlackBox
-from tests.factories import feeds
+from tests.factories.feeds import health
 
-SECOND = 1_000_000_000
 OLD, NEW, NEXT = "palpate-1-a", "palpate-2-b", "palpate-3-c"
-
-
-def health(time_s: float, streams: bool = True) -> Health:
-    """Health of the box at this time."""
-    return feeds.HEALTH._replace(time_ns=round(time_s * SECOND), streams=streams, sweeping=False)
 
 
 def verdict(status: Status = Status.OK) -> Verdict:

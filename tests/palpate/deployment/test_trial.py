@@ -13,24 +13,17 @@ import pytest
 
 from palpate.bundle import bundle
 from palpate.core.errors import BundleError, LineError, ModelError
-from palpate.core.health import Health
 from palpate.core.types import Status, Verdict
 from palpate.deployment.state import MOST_STARTS, Standing
 from palpate.deployment.store import Store
 from palpate.deployment.trial import Trial
-from tests.factories import deliveries, feeds
+from tests.factories import deliveries
 from tests.factories.deliveries import Delivery
+from tests.factories.feeds import health
 from tests.factories.simulated_box import tubes
 
 pytestmark = deliveries.NEEDED
-SECOND = 1_000_000_000
 Ready = tuple[str, str, str]
-
-
-def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
-    """Health of the box at this time."""
-    at_ns = round(time_s * SECOND)
-    return feeds.HEALTH._replace(time_ns=at_ns, streams=streams, sweeping=sweeping)
 
 
 def verdict(label: str = "Canvas") -> Verdict:

@@ -232,6 +232,16 @@ def test_every_difference_is_told(in_service, default_bundle):
     assert outcomes[-1].startswith("30 sweeps: ")
 
 
+def read_higher(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """From now on the program reads higher counts."""
+    outputs = Classifier.outputs
+
+    def worse(self: Classifier, taxels: np.ndarray, *names: str) -> Any:
+        return outputs(self, np.clip(taxels * factor, 0, 255).astype(taxels.dtype), *names)
+
+    monkeypatch.setattr(Classifier, "outputs", worse)
+
+
 def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
     in_service, default_bundle, monkeypatch
 ):
@@ -243,14 +253,9 @@ def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
     assert (count, found) == (SWEEPS, [])
     change(at(folder, 3), bundle="00000000")
     assert changed(folder, OTHERWISE, default_bundle)[0] == SWEEPS - 1
-    outputs = Classifier.outputs
-
-    def worse(self: Classifier, taxels: np.ndarray, *names: str) -> Any:
-        return outputs(self, np.clip(taxels * 1.1, 0, 255).astype(taxels.dtype), *names)
-
     asked = [str(folder), str(DEFAULT), "0"]
     assert main(asked) == 0
-    monkeypatch.setattr(Classifier, "outputs", worse)
+    read_higher(monkeypatch, 1.1)
     assert changed(folder, OTHERWISE, default_bundle)[1]
     assert main(asked) == release_trial.OTHERWISE
     assert changed(folder, OTHERWISE, default_bundle, SWEEPS - 2)[0] == 2
@@ -263,12 +268,7 @@ def test_a_release_that_shifts_most_sweeps_a_little_is_found(
     """Counts that are read 2 % too high, also where each answer stays; of a few sweeps it is no
     proof."""
     folder, _ = in_service
-    outputs = Classifier.outputs
-
-    def worse(self: Classifier, taxels: np.ndarray, *names: str) -> Any:
-        return outputs(self, np.clip(taxels * 1.02, 0, 255).astype(taxels.dtype), *names)
-
-    monkeypatch.setattr(Classifier, "outputs", worse)
+    read_higher(monkeypatch, 1.02)
     monkeypatch.setattr("palpate.runtime.replay._beyond", lambda was, now: "")
     count, found = changed(folder, OTHERWISE, default_bundle)
     assert count / 2 < len(found) <= count
