@@ -50,9 +50,10 @@ _BUNDLES = {
 _SKINS = {
     "list": _Row("show all profiles, with missing features, and whether a device was measured",
         "cli.skin_commands.run_list"),
-    "detect": _Row("find connected skins and the profiles that fit, or propose one for lines of"
-        " numbers; sends nothing, and opens only the ports on USB, or --port",
-        "cli.skin_commands.run_detect", "port write"),
+    "detect": _Row("find connected skins and the profiles that fit; sends nothing, and opens only"
+        " the ports on USB, or --port", "cli.skin_commands.run_detect", "port write"),
+    "new": _Row("write a profile for the lines of numbers that a skin sends",
+        "cli.skin_commands.run_new", "profile needed-port baud grid profiles"),
     "check": _Row("compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
         "cli.skin_commands.run_check", f"{_SKIN} seconds"),
     "show": _Row("show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
@@ -90,7 +91,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
             "cli.bundle_commands.run_list", "json", _BUNDLES),
     },
     "devices": {
-        "skin": _Row("list, detect, check, show or align skins", "", "", _SKINS),
+        "skin": _Row("list, detect, describe, check, show or align skins", "", "", _SKINS),
         "bridge": _Row("pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
             "bridges.command.run"),
     },

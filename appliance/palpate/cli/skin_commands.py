@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.common import load_bundle, load_settings, local_page
 from palpate.cli.devices import open_any, open_devices
+from palpate.core import storage
 from palpate.core.clock import Clock, SystemClock
-from palpate.core.config import Config
+from palpate.core.config import Config, SkinConfig
 from palpate.core.devices import Devices
-from palpate.core.errors import BundleError, ConfigError, SensorError
+from palpate.core.errors import BundleError, ConfigError, SensorError, SensorMismatch
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
+from palpate.core.text import shown
 from palpate.io import serial_port, skin_profile, skins
 from palpate.io.serial_port import PortInfo
 from palpate.io.skin_profile import DEFAULT, SkinProfile
@@ -118,19 +120,41 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
 
     clock, fitting = SystemClock(), 0
     profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
-    wire = skin_profile.adapted(skin_profile.TEXT, settings.skin)
-    grid = (wire.rows, wire.cols) if settings.skin.grid else None
     if ports:
         names = ", ".join(port.path for port in ports)
         log.info(f"listening at {names}; some seconds at each")
-    for one in skin_detect.Ports(_opener(clock), clock).detect(ports, profiles, grid, write=write):
-        # a proposal can go into a file as it is printed
-        print("# " * bool(one.proposal), end="")
+    for one in skin_detect.Ports(_opener(clock), clock).detect(ports, profiles, write=write):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
         if one.proposal:
             print(one.proposal, flush=True)
         fitting += bool(one.profile)
     return fitting
+
+
+def run_new(args: argparse.Namespace) -> int:
+    """Write a profile for the lines of numbers at a port. Raises ConfigError for a name or a grid
+    that cannot be used, and SensorMismatch for other bytes."""
+    from palpate.tools import skin_detect, skin_text
+
+    if not skin_profile.NAME.fullmatch(args.name):
+        raise ConfigError(f"{shown(args.name)} is no name of a profile; use a-z, 0-9 and -")
+    path = (args.out or skins.OWN) / f"{args.name}.toml"
+    if path.exists():
+        raise ConfigError(f"{path} exists; take another name, or delete it")
+    asked = SkinProfile(codec="text", about="lines", source="lines")
+    wire = skin_profile.adapted(asked, SkinConfig(grid=args.grid or ""))
+    clock, port = SystemClock(), args.skin_port
+    log.info(f"listening at {port}")
+    grid = (wire.rows, wire.cols) if args.grid else None
+    bauds = (args.baud,) if args.baud else skin_detect.BAUDS
+    text, sample = skin_detect.Ports(_opener(clock), clock).propose(port, {}, grid, bauds)
+    if not text:
+        line = skin_text.odd_line(sample.data)
+        what = repr(line) if line else f"{len(sample.data)} bytes, and no text"
+        raise SensorMismatch(f"{port} sends {what}; {skin_detect.LINES}; check --grid and --baud")
+    storage.put(path, f"{text}\n".encode(), parents=True, mode=0o644)
+    print(f"{text}\n{path} is written; check it with `palpate skin check --skin {path}`")
+    return 0
 
 
 def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:

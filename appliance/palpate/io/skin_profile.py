@@ -334,8 +334,6 @@ def _outside(p: SkinProfile) -> str:
 
 PALPATE = SkinProfile()
 """The profile that is used if no file defines another."""
-TEXT = SkinProfile(codec="text")
-"""Lines of numbers, before anything is known of them."""
 
 
 def load(name: str, folders: Sequence[Path]) -> SkinProfile:

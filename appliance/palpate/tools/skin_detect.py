@@ -93,27 +93,17 @@ class Ports:
     clock: Clock
 
     def detect(
-        self,
-        ports: Iterable[PortInfo],
-        profiles: Mapping[str, SkinProfile],
-        grid: tuple[int, int] | None = None,
-        *,
-        write: bool = False,
+        self, ports: Iterable[PortInfo], profiles: Mapping[str, SkinProfile], *, write: bool = False
     ) -> Iterator[PortFinding]:
-        """The skins on the ports. grid: rows and columns of a proposal, None for the squarest.
-        write: also ask, and send start commands."""
+        """The skins on the ports. write: also ask, and send start commands."""
         for port in ports:
             try:
-                yield self._on_port(port, profiles, grid, write)
+                yield self._on_port(port, profiles, write)
             except SensorError as e:
                 yield PortFinding(port, "", str(e))
 
     def _on_port(
-        self,
-        port: PortInfo,
-        profiles: Mapping[str, SkinProfile],
-        grid: tuple[int, int] | None,
-        write: bool,
+        self, port: PortInfo, profiles: Mapping[str, SkinProfile], write: bool
     ) -> PortFinding:
         by_ids = [n for n, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
         known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
@@ -135,16 +125,20 @@ class Ports:
         if write and (who := self._asked(port.path)):
             told = f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
             return PortFinding(port, DEFAULT, told)
-        proposal, sample = self._propose(port.path, heard, grid)
+        proposal, sample = self.propose(port.path, heard)
         nothing = _nothing(sample, others, write, bool(proposal))
         return PortFinding(port, "", known + nothing, proposal)
 
-    def _propose(
-        self, path: str, heard: dict[int, HeardBytes], grid: tuple[int, int] | None
+    def propose(
+        self,
+        path: str,
+        heard: dict[int, HeardBytes],
+        grid: tuple[int, int] | None = None,
+        bauds: Iterable[int] = BAUDS,
     ) -> tuple[str, HeardBytes]:
         """The text of a profile for the lines of numbers at a port, or "", and all bytes heard
-        there. heard: by speed so far; BAUDS follow until one gives text. Raises SensorError."""
-        for baud in dict.fromkeys((*heard, *BAUDS)):
+        there. heard: by speed so far; `bauds` follow until one gives text. Raises SensorError."""
+        for baud in dict.fromkeys((*heard, *bauds)):
             if baud not in heard:
                 if heard and not any(one.reads for one in heard.values()):
                     break  # silent at any speed
@@ -239,8 +233,8 @@ def _nothing(
     """The reason why no profile fits, and the remedy."""
     if proposed:
         return (
-            "sends lines of numbers; put what follows into a profile, with its rows and cols (or"
-            " --set skin.grid=ROWSxCOLUMNS here), and let `palpate skin check --skin FILE` check it"
+            "sends lines of numbers; `palpate skin new NAME --port PATH --grid ROWSxCOLUMNS` writes"
+            " what follows, and `palpate skin check --skin NAME` checks it"
         )
     if line := skin_text.odd_line(heard.data):
         return f"sends {line!r}; {LINES}"

@@ -160,8 +160,7 @@ def test_lines_of_numbers_are_described(sent, grid, rows):
     """Log lines between frames are passed over; frames of several lines are for a person."""
     clock = VirtualClock()
     port = WirePort(clock, sent, 1e7)
-    (found,) = skin_detect.Ports(port.open, clock).detect([PortInfo("/dev/a")], {}, grid)
-    text = found.proposal
+    text, _ = skin_detect.Ports(port.open, clock).propose("/dev/a", {}, grid)
     assert text.startswith(f'about = "{rows} taxels' if rows else "")
     assert bool(text) == bool(rows)
 
@@ -192,23 +191,31 @@ def test_other_speeds_are_tried_until_one_gives_text(baud):
         right: WirePort(clock, (lambda i: bytes([200] * 9), numbers)[right], 1e7)
         for right in (False, True)
     }
-    listener = skin_detect.Ports(lambda p, b: ports[b == baud].open(p, b), clock)
-    (found,) = listener.detect([PortInfo("/dev/a")], {})
-    assert f"baud = {baud}" in found.proposal
+    text, _ = skin_detect.Ports(lambda p, b: ports[b == baud].open(p, b), clock).propose(
+        "/dev/a", {}
+    )
+    assert f"baud = {baud}" in text
 
 
-def test_a_printed_profile_loads(capsys, tmp_path, monkeypatch):
-    """With the grid of the settings; a wrong grid is refused before the port is opened."""
+@pytest.mark.parametrize(("sent", "code"), [(numbers, 0), (lambda i: b"Press any key\n", 69)])
+def test_a_profile_is_written(capsys, tmp_path, monkeypatch, sent, code):
+    """It loads; wrong names and grids are refused before the port is opened."""
     clock = VirtualClock()
-    opened = lambda path, baud, clock: WirePort(clock, numbers, 1e7).open(path, baud)  # noqa: E731
+    opened = lambda path, baud, clock: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
     monkeypatch.setattr("palpate.io.serial_link.SerialLink", opened)
     monkeypatch.setattr("palpate.cli.skin_commands.SystemClock", lambda: clock)
-    words = ["skin", "detect", "--port", "/dev/a", "--set", "skin.grid=2x8"]
-    assert main(words) == 1
-    (tmp_path / "mine.toml").write_text(capsys.readouterr().out)
+    words = ["skin", "new", "mine", "--port", "/dev/a", "--out", str(tmp_path), "--grid"]
+    assert main([*words, "4x4"]) == code
+    told = capsys.readouterr()
+    if code:
+        assert "Press any key" in told.err
+        assert not list(tmp_path.iterdir())
+        return
     made = skin_profile.load(str(tmp_path / "mine.toml"), [])
-    assert (made.rows, made.cols) == (2, 8)
-    assert main([*words[:-1], "skin.grid=4"]) == 78
+    assert (made.rows, made.cols, made.baud) == (4, 4, 115200)
+    assert main([*words, "4x4"]) == 78
+    assert main([*words[:2], "../a", *words[3:], "4x4"]) == 78
+    assert main([*words[:2], "b", *words[3:], "4"]) == 78
 
 
 def test_another_package_in_place_of_pyserial(tmp_path):
