@@ -25,7 +25,7 @@ MAINS_HZ = (50.0, 60.0)
 ASIDE = (3, 4, 5)
 """Distances of the frequencies beside a line to which it is compared, in periods per window. A Hann
 window keeps a line within two."""
-QUIET = 4
+ONE_IN = 4
 """A line is searched in one of so many taxels: those that vibrate least beside its frequency,
 because all taxels have the same hum."""
 IN_PHASE = 0.9
@@ -145,7 +145,7 @@ class HumFilter:
         possible = power[:, 0] >= least**2 * beside
         for i in np.flatnonzero(possible.any(axis=1)) if possible.any() else ():
             near = np.sqrt(beside[i])
-            quiet = np.argsort(near)[: max(1, len(near) // QUIET)]
+            quiet = np.argsort(near)[: max(1, len(near) // ONE_IN)]
             at = parts[i, 0, quiet]
             size = np.abs(at).sum()
             ratio = size / max(near[quiet].sum(), TINY)

@@ -26,7 +26,7 @@ MANY, CLEAR = 4, 2 * CHANCE
 """Fewest sweeps by which others are judged, and the least median height of their patterns. The
 median of simulated slides is 20, that of skins whose slides show no pattern 3 to 6."""
 NO_SLIDE = f"no slide: {NO_PATTERN}, as with a resting finger"
-QUIET = math.log(4)
+RESTING = math.log(4)
 """A sweep rests if its vibration over load is less than a quarter of the median of its material, in
 logarithms. Slides over one material differ by less in the simulator."""
 RESTS = "the finger rests: other sweeps of this material vibrate four times as much"
@@ -119,7 +119,7 @@ class SlidesAmong:
             return SlideFinding(
                 unchecked=f"rest not checked: it takes {MANY} sweeps of the material"
             )
-        if one.vibration < float(np.median([other.vibration for other in own])) - QUIET:
+        if one.vibration < float(np.median([other.vibration for other in own])) - RESTING:
             return SlideFinding(RESTS)
         return SlideFinding()
 

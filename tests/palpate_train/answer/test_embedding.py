@@ -5,6 +5,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_train.answer import embedding
+from palpate_train.metrics import tolerances
 from tests.factories.later import Later
 
 discriminant_analysis = Later("sklearn.discriminant_analysis")
@@ -137,7 +138,7 @@ def test_what_cannot_be_embedded_is_refused(labels, why: str):
 def test_the_limit_keeps_what_it_promises():
     """A limit of 99 sweeps keeps the stated share of new sweeps; of few it is the largest."""
     rng = np.random.default_rng(0)
-    for asked in (0.95, embedding.KEPT):
+    for asked in (0.95, tolerances.KEPT):
         kept = [
             np.mean(rng.chisquare(5, 500) <= embedding.limit(rng.chisquare(5, 99), asked))
             for _ in range(200)

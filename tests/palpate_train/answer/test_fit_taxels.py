@@ -19,7 +19,7 @@ from palpate_train.data import sets
 from palpate_train.data.corruptions import dead
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
-from palpate_train.metrics import bundle_score
+from palpate_train.metrics import bundle_score, tolerances
 from tests.factories import toy_bundle
 
 FORMAT = replace(toy_bundle.FORMAT, rows=4, cols=4, window=100)
@@ -44,7 +44,7 @@ def test_limits_are_beyond_all_sound_sweeps():
     sweeps = windows("a", "b")
     rule = fit_taxels.learned(sweeps)
     assert (rule.taxels, rule.row, rule.column, rule.still) == (0, False, False, False)
-    assert rule.noise >= fit_taxels.MARGIN
+    assert rule.noise >= tolerances.CLEAR
     assert rule.quietest > 1
 
 

@@ -36,7 +36,7 @@ from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.export import contents, pack, quantized_bundle
 from palpate_train.export.contents import ExportRefused
-from palpate_train.metrics import bundle_score
+from palpate_train.metrics import bundle_score, tolerances
 from palpate_train.metrics.answers import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods
@@ -181,7 +181,7 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert fused["n"] == len(fitted.held) / 2
     result = manifest.figures["parity"]
     assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
-    assert result["lost"] <= quantized_bundle.MOST_LOST
+    assert result["lost"] <= tolerances.LOST
     assert result["total"] == len(fitted.held)
     weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
     assert manifest.thresholds.contact == pytest.approx(0.1 * weakest)

@@ -17,7 +17,7 @@ from palpate_train.cli.main import main
 from palpate_train.data import junk, sets
 from palpate_train.export import trial
 from palpate_train.export.trial import Counts
-from palpate_train.metrics import bundle_score
+from palpate_train.metrics import bundle_score, tolerances
 
 SWEEPS = "sim:T-REAL/level-blind:41:1"
 ALONE = {"slide", "vibration", "hum", "taxels"}
@@ -70,7 +70,7 @@ def test_a_rule_is_dropped_kept_or_forced(
     """Half a point of copies, any junk, or a wish keeps it."""
     monkeypatch.setattr(trial, "EACH", 6)
     monkeypatch.setattr(trial, "_counted", counts(needed, junk_needs))
-    monkeypatch.setattr(trial, "LEAST", 1 / 300)
+    monkeypatch.setattr(tolerances, "LOST", 1 / 300)
     judge = rules.without(packaged(), ["disturbance", "displacement"])
     found, figures = trial.decided(judge, sets.load(SWEEPS), 0, asked)
     assert set(found) == out

@@ -31,12 +31,11 @@ from palpate_train.answer.stranger_limits import LeftOut
 from palpate_train.data.corruptions import TAXEL_FAULTS, Corruption, applicable
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
+from palpate_train.metrics import tolerances
 
 Array = NDArray[Any]
 FIGURES = "altered sweeps"
 """Key of the figures in a manifest."""
-COPIES = 360
-"""Largest number of copies of each kind; of judged sweeps there are as many at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +130,7 @@ def disturbed(
     for corruption in applicable(every):
         if (kind := corruption.name) in TAXEL_FAULTS:
             continue
-        source = rng.permutation(len(sweeps))[:COPIES]
+        source = rng.permutation(len(sweeps))[: tolerances.COPIES]
         samples, severity = altered_copies(corruption, every, source, seed)
         name, counts = fit_disturbance.OF_KIND.get(kind), np.empty(0)
         if name == "hum":

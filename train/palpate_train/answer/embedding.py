@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from palpate.answer.unknown import Classes, shaped_distances
 from palpate.core.errors import FormatError
 from palpate_train.answer.heads import shrinkage
+from palpate_train.metrics import tolerances
 from palpate_train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
-KEPT = 0.995
-"""Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
-network computes (docs/decisions/0005)."""
 PARTS = 10
 """Largest number of parts of the groups; each part is judged by a fit to the others."""
 FEW_SHARE = 1.5
@@ -388,7 +386,7 @@ def cross_fitted(
         yield fit, numbers[np.isin(labels[numbers], present)], embedding, present
 
 
-def limit(novelty: Array, kept: float = KEPT) -> float:
+def limit(novelty: Array, kept: float = tolerances.KEPT) -> float:
     """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not
     trained on. NaN is left out.
 

@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from palpate.answer.contact import MOST_POSITIONS, ContactPositions, centre
 from palpate.answer.unloaded import UnloadedSkin
+from palpate.answer.window_check import SHARE
 from palpate.core.types import normal
 from palpate.sim import skin
 from palpate_train.answer import embedding
 from palpate_train.data.sets import Dataset
 
 Array = NDArray[Any]
-SHARE = 0.1
-"""Smallest load of a loaded taxel, as a share of the strongest taxel's load in the weakest
-contact."""
 BASELINE = 0.5
 """Raw counts are not taken as loads if every taxel in every sweep reads more than this share of the
 highest reading: some taxels are hardly touched, and some contacts are stronger than others."""
@@ -173,7 +171,7 @@ def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
     """The centre of contact at each position of `sweeps`, or in each recording if positions are
     unknown; None without a limit or a contact. Loads are those of a box that was not tared.
 
-    The limit of the distance keeps embedding.KEPT of positions whose own sweeps were left out,
+    The limit of the distance keeps tolerances.KEPT of positions whose own sweeps were left out,
     judged by their farthest sweep, as embedding.limit computes it: all of a few positions.
     """
     if limit.contact is None:

@@ -20,10 +20,10 @@ from palpate.answer.objects import softmax
 from palpate.answer.unknown import Classes, DisplacedClasses, DisplacementRule
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
-from palpate_train.answer import embedding
 from palpate_train.answer.embedding import Embedding, embed, limit
 from palpate_train.data.augment import Augmentation, augment
 from palpate_train.data.sets import Dataset
+from palpate_train.metrics import tolerances
 from palpate_train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
@@ -35,10 +35,6 @@ UNSURE = np.arange(50, 100) / 100
 """Candidates for the least probability with which a displaced sweep is ok."""
 NEVER = 1.01
 """A least probability that no sweep reaches."""
-MOST = 360
-"""Largest number of sweeps that are displaced."""
-KEPT = 0.99
-"""Share of the copies that lie within the limit. A few lie further, because gains differ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +81,7 @@ def fit(
     embedded: Callable[[Array, Array], Embedding],
     copied: AugmentedCopies,
     logits: Array,
-    kept: float = embedding.KEPT,
+    kept: float = tolerances.KEPT,
 ) -> DisplacementFit | None:
     """The rule for displaced sweeps; None without copies to fit it to and to judge it by.
 
@@ -134,7 +130,7 @@ def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
     if rule is None or place is None or contact is None or train.format.cols < 2:
         return manifest
     rng, shift = np.random.default_rng(seed), _shift(manifest.made)
-    some = train.take(rng.permutation(len(train))[:MOST])
+    some = train.take(rng.permutation(len(train))[: tolerances.COPIES])
     loads = some.samples.mean(axis=1, dtype=np.float64) - manifest.tare
     still = dict.fromkeys(vars(Augmentation()), 0.0)
     only_moved = Augmentation(**still | {"shift": shift, "displaced": 1.0})
@@ -143,7 +139,7 @@ def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
     )
     means = moved.reshape(loads.shape) + manifest.tare
     mm = [displacement(mean, manifest.tare, contact, place).mm for mean in means]
-    farthest = float(np.quantile(mm, KEPT)) + place.limit_mm
+    farthest = float(np.quantile(mm, tolerances.KEPT_COPIES)) + place.limit_mm
     return replace(manifest, displacement=replace(rule, farthest_mm=round(farthest, 3)))
 
 

@@ -19,6 +19,7 @@ from palpate.bundle.contents import Bundle
 from palpate.core.types import SweepFormat
 from palpate_train.answer import fit_hum
 from palpate_train.answer.fit_unknown import DisturbedSweeps
+from palpate_train.metrics.tolerances import KEPT_COPIES, MARGIN, OUTER
 
 Array = NDArray[Any]
 MADE_BY: dict[tuple[Name, int], tuple[str, ...]] = {
@@ -36,13 +37,9 @@ HARDER = "speed"
 """The disturbance whose copies stretch the counts in time. In them the vibrations of skin and
 finger change their frequency, too, which they do not at another speed. Such copies are harder than
 a real slide: the means must not follow them, and where they fail nothing is refused."""
-OUTER = {"noise": 0.02, "load": 0.1, "speed": 0.02}
+OUTERMOST = {"noise": OUTER, "load": 0.1, "speed": OUTER}
 """Share of the training sweeps beyond each edge. Loads spread widely, and a lower gain looks like
 a lower load; hum and lost frames begin at 0."""
-MARGIN = 1.05
-"""The furthest value that is allowed for is this many times the furthest of the copies."""
-KEPT = 0.99
-"""Share of the copies of each severity that the limit keeps."""
 LOSS = 0.15
 """Accuracy that the nearest means may lose, as a share. Copies of a severity that costs more are
 not allowed for."""
@@ -163,7 +160,7 @@ def fit(judge: Judge, *training: DisturbedSweeps) -> AllowanceFit:
         tried = every.take(judge.bearable(made) & (every.size > 0))
         if len(tried.size) < FEWEST_COPIES:
             continue
-        end = MARGIN * float(tried.size.max())
+        end = (1 + MARGIN) * float(tried.size.max())
         copies = [_Tried.of(altered, made, sign, start) for altered in training]
         moved = [_changes(one.take(one.size <= end), len(judge.means)) for one in copies]
         still = [np.zeros_like(moved[0])] * len(moved)
@@ -171,7 +168,7 @@ def fit(judge: Judge, *training: DisturbedSweeps) -> AllowanceFit:
         choices = [(_slope(judge, tried, of[0]), of) for of in ways]
         judged, moved = max(choices, key=lambda choice: choice[0].worth)
         slope, figures[f"{name}{'+' if sign > 0 else '-'}"] = judged.slope, judged.figures
-        furthest = MARGIN * float(every.size.max())
+        furthest = (1 + MARGIN) * float(every.size.max())
         at = [round(start + sign * size, 4) for size in (0.0, end, furthest)]
         further = at[2] if name == HARDER and at[2] != at[1] else None
         found.append(Allowance(name, at[0], at[1], slope, further))
@@ -209,12 +206,12 @@ def _edges(training: DisturbedSweeps) -> dict[tuple[Name, int], tuple[float, lis
 def _edge(name: str, sign: int, values: Array) -> float | None:
     """Where training ends on one side, from the values [N] of training sweeps; None if too few of
     them are known."""
-    if name not in OUTER:
+    if name not in OUTERMOST:
         return 0.0
     known = values[np.isfinite(values)]
     if len(known) < len(values) / 2:
         return None
-    outer = OUTER[name]
+    outer = OUTERMOST[name]
     return float(np.quantile(known, 1 - outer if sign > 0 else outer))
 
 
@@ -252,13 +249,13 @@ class _Slope:
 
 
 def _slope(judge: Judge, tried: _Tried, change: Array) -> _Slope:
-    """The least growth of the limit that keeps KEPT of the copies, of small disturbances and of
-    large ones, if the means move by `change` [K, r]."""
+    """The least growth of the limit that keeps KEPT_COPIES of the copies, of small disturbances
+    and of large ones, if the means move by `change` [K, r]."""
     before = judge.distances(tried.z)
     after = judge.distances(tried.z, tried.size[:, None, None] * change)
     needed = ((after.min(axis=1) - 1) / tried.size)[np.argsort(tried.size, kind="stable")]
     by_size = np.array_split(needed, SEVERITIES)
-    slope = max(0.0, *(float(np.quantile(part, KEPT)) for part in by_size if len(part)))
+    slope = max(0.0, *(float(np.quantile(part, KEPT_COPIES)) for part in by_size if len(part)))
 
     def within(distances: Array, limit: Array | float) -> float:
         return float((distances.min(axis=1) <= limit).mean())

@@ -23,6 +23,7 @@ from palpate_train.answer.embedding import JudgingPart, centred, limit
 from palpate_train.answer.heads import ABSENT, shrinkage
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import sufficient_temperature
+from palpate_train.metrics.tolerances import LOST
 from palpate_train.onnx_tools.graph_builder import run_output
 
 Array = NDArray[Any]
@@ -36,8 +37,6 @@ FLAT = 1e-6
 """Least variance of a direction, relative to the mean variance of all directions."""
 AGREE = (1, 2, 3)
 """Numbers of successive steps that a rule may require to agree."""
-MAX_LOSS = 0.005
-"""Share of sweeps whose right answer may become wrong by an early answer."""
 MIN_SWEEPS = 40
 """Smallest number of sweeps to find a rule on."""
 KEPT = 0.9
@@ -196,7 +195,7 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
     sweeps that the heads did not see.
 
     For each number of steps that must agree, levels are tried from the strictest on, until one
-    turns more than MAX_LOSS of the sweeps from right to wrong. A looser level that seems to do
+    turns more than LOST of the sweeps from right to wrong. A looser level that seems to do
     better after that does so by chance (fixed sequence testing; Maurer et al. 1995).
     """
     if (n := len(labels)) < MIN_SWEEPS:
@@ -208,16 +207,15 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
     right = probabilities[:, -1].argmax(1) == labels
     best = EarlyRule(
         None,
-        f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {MAX_LOSS:.1%} of "
-        f"{n} "
-        "held-out sweeps wrong",
+        f"no rule needs less than {MAX_SHARE:.0%} of the sweep and turns at most {LOST:.1%} of "
+        f"{n} held-out sweeps wrong",
         n=n,
     )
     for agree in AGREE:
         for level in LEVELS:
             early = Early((level,) * (probabilities.shape[1] - 1), agree)
             label, share = decide(probabilities, early)
-            if (lost := float(np.mean(right & (label != labels)))) > MAX_LOSS:
+            if (lost := float(np.mean(right & (label != labels)))) > LOST:
                 break
             if share.mean() < min(best.share, MAX_SHARE):
                 best = EarlyRule(early, "", float(share.mean()), lost, n)

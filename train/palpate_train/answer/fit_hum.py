@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from palpate.answer.hum import HumFilter
 from palpate.bundle.contents import Bundle
 from palpate.core.types import SweepFormat
+from palpate_train.metrics import tolerances
 
 Array = NDArray[Any]
 STANDS_OUT, MOST_RATIO = 3.5, 20.0
 """Least ratio of hum that is removed, and the largest limit: beyond it training sweeps have
 something like hum, so nothing is removed."""
-TRAINED, MOST_OF = 1.25, 0.995
-"""The limit is this many times the ratio of this share of the training sweeps."""
 
 
 def fit(format: SweepFormat, trained: Array) -> float | None:
@@ -27,7 +26,7 @@ def fit(format: SweepFormat, trained: Array) -> float | None:
     if not find.hz:
         return None
     ratios = [find.ratio(window) for window in trained]
-    limit = max(STANDS_OUT, TRAINED * float(np.quantile(ratios, MOST_OF)))
+    limit = max(STANDS_OUT, tolerances.CLEAR * float(np.quantile(ratios, tolerances.KEPT)))
     return round(limit, 2) if limit <= MOST_RATIO else None
 
 
@@ -43,8 +42,5 @@ def cleaned(format: SweepFormat, least: float | None, samples: Array) -> tuple[A
 def without(bundle: Bundle) -> Bundle:
     """The bundle that removes no hum."""
     allowed = bundle.manifest.disturbances
-    if not (allowed and allowed.hum):
-        return bundle
-    return replace(
-        bundle, manifest=replace(bundle.manifest, disturbances=replace(allowed, hum=None))
-    )
+    less = allowed and replace(allowed, hum=None)
+    return replace(bundle, manifest=replace(bundle.manifest, disturbances=less))

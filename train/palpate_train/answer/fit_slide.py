@@ -16,17 +16,13 @@ from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.data.sets import Dataset
+from palpate_train.metrics.tolerances import MARGIN, OUTER
 
 MOST_SWEEPS = 1000
 """Most sweeps that are measured, evenly spread over the set."""
 LEAST_SHARE, LEAST_SWEEPS = 0.2, 5
 """Least share and number of measured sweeps that give a range."""
-OUTER = 0.02
-"""Share of the measured sweeps at each end that the range leaves out, since a few speeds are
-wrong."""
-MARGIN = 0.05
-"""A part rests if it vibrates less than any part in training by this much (natural logarithm)."""
-FEWEST_SLIDES = 100
+FEWEST_SLIDES = round(2 / OUTER)
 """Least number of training sweeps of each label. The next sweep has less vibration than the least
 of n sweeps with a probability of 1 / (n + 1)."""
 STILL = 0.5 * float(np.log(TINY)) / 2
@@ -89,7 +85,7 @@ def _least(manifest: Manifest, train: Dataset) -> tuple[float, ...]:
     found = [float(least[train.labels == k].min(initial=np.inf)) for k in labels]
     if not all(np.isfinite(v) and v > STILL for v in found):
         return ()
-    return tuple(round(v - MARGIN, 3) for v in found)
+    return tuple(round(v - MARGIN, 3) for v in found)  # of a logarithm, so it is a share
 
 
 def text(manifest: Manifest) -> str:

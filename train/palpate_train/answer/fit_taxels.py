@@ -29,13 +29,11 @@ from palpate.inference.classifier import Classifier
 from palpate_train.data.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
-from palpate_train.metrics import bundle_score
+from palpate_train.metrics import bundle_score, tolerances
 
 Array = NDArray[Any]
 FIGURES = "broken taxels"
 """Key of the figures in a manifest."""
-MARGIN = 1.25
-"""A noisy taxel has this many times the noise, against its neighbours, of any taxel in training."""
 SILENT = ("dead", "stuck")
 """Faults that the box refuses where it does not bridge them. A noisy taxel that it does not bridge
 costs what it costs without bridging, so it does not decide the number."""
@@ -155,11 +153,11 @@ def learned(sound: Dataset) -> Bridging:
     around, noise = np.array(near), np.array(own)
     heard = np.isfinite(around) & (around > 0)
     if not heard.any():  # every window is constant
-        return Bridging(0, False, False, MARGIN, 1.0, True)
+        return Bridging(0, False, False, tolerances.CLEAR, 1.0, True)
     quietest = float(around[heard].min())
     ratio = float((noise / np.maximum(around, quietest))[heard].max())
     still = any(bool((tenth.still & tenth.lively(quietest)).any()) for tenth in tenths)
-    return Bridging(0, False, False, MARGIN * max(1.0, ratio), quietest, still)
+    return Bridging(0, False, False, tolerances.CLEAR * max(1.0, ratio), quietest, still)
 
 
 class _Bench:

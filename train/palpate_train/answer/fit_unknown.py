@@ -28,6 +28,7 @@ from palpate_train.answer.embedding import (
     shapes_of,
     within,
 )
+from palpate_train.metrics.tolerances import LEFT_OUT
 
 Array = NDArray[Any]
 Embed = Callable[[Array], Array]
@@ -46,8 +47,6 @@ FEWEST_JUDGED = 8
 TRAINED = (0.1, 0.3, 1.0, 3.0)
 """Weights of the directions in which the trained materials differ, beside 1 for the features that
 were not trained. Which of the two shows an unknown material depends on the skin."""
-MOST_LEFT_OUT = 12
-"""Largest number of materials that are left out in turn to choose this weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +144,7 @@ class Scatters:
         k, areas = len(self.own), []
         away = judged.z[:, None] - self.space.means
         untrained = shaped_distances(away, shapes_of(within(self.own, self.space.untrained)))
-        for number in np.unique(np.linspace(0, k - 1, min(k, MOST_LEFT_OUT)).round().astype(int)):
+        for number in np.unique(np.linspace(0, k - 1, min(k, LEFT_OUT)).round().astype(int)):
             others, unknown = np.delete(np.arange(k), number), judged.labels == number
             shapes = shapes_of(within(self.own[others], self.space.trained(number)))
             trained = shaped_distances(away[:, others], shapes)

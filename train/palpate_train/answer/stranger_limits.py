@@ -21,6 +21,7 @@ from palpate.answer.unknown import Known, shaped_distances
 from palpate.core.errors import FormatError
 from palpate.core.statistics import interval
 from palpate.sweeps.sweep_folder import NOT_THIS
+from palpate_train.metrics.tolerances import KEPT, LEFT_OUT
 
 Array = NDArray[Any]
 FIGURES = "unknown materials"
@@ -34,9 +35,8 @@ On two simulated worlds and three materials, left out with a third of the positi
 MOST_UNKNOWN = 0.5
 """Largest share of held-out sweeps that a bundle may call unknown: export refuses it else."""
 LEAST_KEPT = {"strict": 1 - MOST_UNKNOWN, "balanced": 1 - MOST_UNKNOWN, "loose": 0.9}
-MOST_KEPT = 0.995
-"""Least share of known sweeps within each limit, and the largest, at any cost. A box that refuses
-more is of no use; a wider limit only lets strangers in."""
+"""Least share of known sweeps within each limit, at any cost; the largest is KEPT. A box that
+refuses more is of no use; a wider limit only lets strangers in."""
 FEW_SWEEPS, LEAST_OF_FEW, LEAST_BY_JUNK = 50, 0.9, 0.85
 """Up to this number of sweeps of a material, the balanced limit keeps such a share, less with junk
 that shows where other things lie. Few sweeps say too little of strangers to give up known sweeps
@@ -49,8 +49,6 @@ STEPS, DRAWN = 500, 12
 WIDTH = 1.06
 """Bandwidth of the density of n values, as a multiple of their deviation times n ** -0.2 (Silverman
 1986)."""
-MOST_LEFT_OUT = 12
-"""Largest number of materials that are left out in turn."""
 FEW = 3
 """Up to this number of materials, too few are left out, and the shares are a guess."""
 
@@ -144,7 +142,7 @@ def limits(
     kind of its own.
 
     Each material has the same weight. Densities have smooth tails, so that a few sweeps promise
-    nothing that they do not show. Without unknown sweeps the limits keep MOST_KEPT.
+    nothing that they do not show. Without unknown sweeps the limits keep KEPT.
     stranger_cost: multiplies COSTS. Raises FormatError without a known sweep, and for a
     cost of 0 or less.
     """
@@ -164,7 +162,7 @@ def limits(
     own = [_log(junk[NOT_THIS])] if NOT_THIS in junk else []
     weight = (counted := sum(map(len, own))) / (counted + FEW_STRANGERS)
     wrong = named + _share_below(grid, made) + weight * _share_below(grid, own)
-    most, chosen, least_kept = int(np.argmax(kept >= MOST_KEPT)), {}, dict(LEAST_KEPT)
+    most, chosen, least_kept = int(np.argmax(kept >= KEPT)), {}, dict(LEAST_KEPT)
     if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
         least_kept["balanced"] = LEAST_BY_JUNK if junk else LEAST_OF_FEW
     for name, cost in COSTS.items():
@@ -257,12 +255,12 @@ def nearest_other(
 ) -> Array:
     """Squared distances [n] of embeddings z [n, r] to the nearest mean of another material than
     their own. means: [K, r]. shapes_without: gives the shapes [K - 1, r, r] of a model without
-    material k. NaN without another material. Of many materials MOST_LEFT_OUT are left out, and the
+    material k. NaN without another material. Of many materials LEFT_OUT are left out, and the
     others get NaN."""
     distances = np.full(len(z), np.nan)
     if len(means) < 2:
         return distances
-    spread = np.linspace(0, len(means) - 1, min(len(means), MOST_LEFT_OUT)).round().astype(int)
+    spread = np.linspace(0, len(means) - 1, min(len(means), LEFT_OUT)).round().astype(int)
     for k in np.intersect1d(spread, labels):
         own, others = labels == k, np.delete(means, k, axis=0)
         distances[own] = shaped_distances(z[own][:, None] - others, shapes_without(k)).min(axis=1)

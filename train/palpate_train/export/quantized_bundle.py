@@ -19,6 +19,7 @@ from palpate_train.data import extras
 from palpate_train.export import fit_rules, pack
 from palpate_train.export.contents import Content, ExportRefused, content_of
 from palpate_train.export.pack import PackOptions
+from palpate_train.metrics import tolerances
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
 from palpate_train.models.recipe.fitted import Fit, finished
@@ -30,14 +31,12 @@ Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
 """Largest difference of a logit between PyTorch and the float graph, which add the same numbers in
 another order."""
-MOST_LOST = 0.005
-"""Largest loss of accuracy on held-out sweeps by int8: as expected from float's probabilities
-(AnswerDifference.expected_loss), for any number of sweeps; and as counted, if that is significant.
-Counting alone is not enough: two uncertain sweeps of a hundred that change their label are two
-points lost or won."""
 CHANCE = 0.05
 """Level of significance of the one-sided sign test on the sweeps on which both precisions differ,
-that int8 is not worse. The counted loss is used only if the probability is below it."""
+that int8 is not worse. The loss of accuracy by int8 is limited as expected from float's
+probabilities (AnswerDifference.expected_loss), for any number of sweeps; and as counted, if the
+probability is below this. Counting alone is not enough: two uncertain sweeps of a hundred that
+change their label are two points lost or won."""
 LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 0.025
 """Least share of held-out sweeps with equal labels, of which one may always differ; largest change
 of a probability, and largest mean change. The worst of 14 fits of four sizes to five sets had
@@ -140,15 +139,15 @@ def check(found: Parity) -> None:
     apart, lost = found.answers, found.accuracy
     largest, mean = apart.probability_difference, apart.probability_mean
     why = ""
-    if lost.lost > MOST_LOST and lost.chance < CHANCE:
+    if lost.lost > tolerances.LOST and lost.chance < CHANCE:
         why = (
             f"is right on {lost.int8_right} of {lost.total} held-out sweeps, float on "
-            f"{lost.float_right}: {100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST})"
+            f"{lost.float_right}: {100 * lost.lost:.2f} points lost (limit {100 * tolerances.LOST})"
         )
-    elif not apart.expected_loss <= MOST_LOST:
+    elif not apart.expected_loss <= tolerances.LOST:
         why = (
             f"loses {100 * apart.expected_loss:.2f} points on held-out sweeps, by float's own "
-            f"probabilities (limit {100 * MOST_LOST})"
+            f"probabilities (limit {100 * tolerances.LOST})"
         )
     elif not (largest <= MOST_PROBABILITY_DIFFERENCE and mean <= MOST_MEAN_DIFFERENCE):
         why = (

@@ -30,13 +30,11 @@ from palpate_train.data.corruptions import applicable
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.junk import JUNK, SLIDES_FIRST, windows
 from palpate_train.data.sets import Dataset
-from palpate_train.metrics import bundle_score
+from palpate_train.metrics import bundle_score, tolerances
 
 Array = NDArray[Any]
 EACH = 16
 """Sweeps of each kind. With fewer held-out sweeps no rule is tried, and all stay."""
-LEAST = 0.005
-"""Share of the copies that a rule has to save."""
 MOVED = Augmentation(**dict.fromkeys(vars(Augmentation()), 0.0) | {"shift": 1.0, "displaced": 1.0})
 """Displaced by up to a row, as a skin that was put back."""
 
@@ -89,7 +87,7 @@ def decided(
     for name in tried:
         less = RULES[name].without(judge)
         then = _counted(less, given)
-        kept = now.right - then.right >= LEAST * n or then.wrong > now.wrong
+        kept = now.right - then.right >= tolerances.LOST * n or then.wrong > now.wrong
         figures[name] = {
             "kept": kept,
             "because": "tried",

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from palpate_studies import TEMPLATES
-from palpate_train.answer.embedding import KEPT
+from palpate_train.metrics.tolerances import KEPT
 from palpate_train.models.methods import PACKAGED, SHIPPED
 from palpate_train.reports import bundle_report, formatting, html, provenance
 

@@ -19,6 +19,7 @@ from palpate.answer.objects import softmax
 from palpate_train.answer.heads import ABSENT, HeadData, HeadPart, HeadPlan
 from palpate_train.data.splitters import InnerPart
 from palpate_train.metrics.temperature import weighted_platt_temperature
+from palpate_train.metrics.tolerances import LOST
 from palpate_train.models.methods import Log
 from palpate_train.models.recipe import relations
 from palpate_train.models.recipe.bank import LEAST_FILTERS
@@ -32,9 +33,8 @@ the best of about ten."""
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on copies and stages improve too little for their share of
 a fit's time, and stages for that of the bundle."""
-MOST_LOST, MOST_WORSE = 0.005, 0.02
-"""Largest loss of accuracy and largest rise of the cross entropy by which fewer filters are still
-chosen."""
+MOST_WORSE = 0.02
+"""Largest rise of the cross entropy by which fewer filters are still chosen."""
 Columns = tuple[int, ...]
 
 
@@ -216,12 +216,12 @@ class PairedDifference:
 
     @property
     def holds(self) -> bool:
-        """At most MOST_LOST less accuracy, one standard error or one sweep included, and at most
-        MOST_WORSE more loss. No group may lose more than MOST_LOST either: an easier group does
+        """At most LOST less accuracy, one standard error or one sweep included, and at most
+        MOST_WORSE more loss. No group may lose more than LOST either: an easier group does
         not make up for what a new force would lose."""
         lost = max(-self.won.sum(), 0) + max(_error(self.won), 1 / len(self.won))
-        each = all(-self.won[of].sum() <= MOST_LOST * of_them.sum() for of, of_them in self.groups)
-        return bool(lost <= MOST_LOST and -self.saved.sum() <= MOST_WORSE and each)
+        each = all(-self.won[of].sum() <= LOST * of_them.sum() for of, of_them in self.groups)
+        return bool(lost <= LOST and -self.saved.sum() <= MOST_WORSE and each)
 
     def _clear(self, gain: Array) -> bool:
         """Whether a gain [n] is more than ERRORS standard errors, the larger of that over parts and
