@@ -65,6 +65,15 @@ def test_few_sweeps_search_few_places(tmp_path: Path):
     assert len(bench.places()) == fit_taxels.MOST
 
 
+def test_large_windows_are_searched_with_fewer_sweeps(monkeypatch: pytest.MonkeyPatch):
+    """In proportion to the counts of a window, but never fewer than may be broken."""
+    test = EvaluationSweeps.of(windows("a", "b"), 4, 0)
+    size = test.sweeps.samples[0].size
+    for large, searched in ((size, 40), (size // 2, 20), (1, fit_taxels.MOST)):
+        monkeypatch.setattr(fit_taxels, "LARGE", large)
+        assert fit_taxels._searched(40, test) == searched
+
+
 def test_a_bundle_that_needs_one_taxel_tolerates_none(tmp_path: Path):
     """The toy knows "b" from taxel 1.1 alone; a row or a column may hold it as well."""
     loaded, sweeps = bundle.load(toy(tmp_path)), windows("a", "b", "c")

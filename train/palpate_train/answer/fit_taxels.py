@@ -44,6 +44,9 @@ CANDIDATES = 32
 sweeps would find more of them by chance, so there are MOST, or as many as sweeps."""
 SEARCHED, JUDGED = 40, 240
 """Number of sweeps that find the worst places, and that judge the answers there."""
+LARGE = 100_000
+"""Number of counts of a window from which on fewer sweeps search, and fewer places: with 80 taxels
+and 8,800 frames the search took minutes."""
 MODES, MOST_VALUES = 2, 256
 """Number of modes of loads, and the largest number of values of a frame for which they are learned:
 a manifest holds three numbers for each."""
@@ -109,7 +112,7 @@ def _better(
 ) -> _Bench:
     """With `loads` where the worst single taxel then leaves the true material more probable than
     with neighbours, by GAIN; else without."""
-    sample = EvaluationSweeps.of(test.sweeps, SEARCHED, seed)
+    sample = EvaluationSweeps.of(test.sweeps, _searched(SEARCHED, test), seed)
     near = _Bench.of(bundle, rule, test, sample, seed)
     if loads is None:
         return near
@@ -202,7 +205,7 @@ class _Bench:
 
     def places(self) -> list[int]:
         """Numbers of the taxels that are tried: those with the strongest signal."""
-        tried = min(CANDIDATES, max(MOST, len(self._test.sweeps)))
+        tried = min(_searched(CANDIDATES, self._test), max(MOST, len(self._test.sweeps)))
         strongest: list[int] = np.argsort(-self.signal, axis=None)[:tried].tolist()
         return strongest
 
@@ -278,6 +281,11 @@ def _worst_places(bench: _Bench, most: int) -> Iterable[Array]:
         left = [at for at in bench.places() if not mask.flat[at]]
         mask, _ = bench.worst(map(_with(mask), left))
         yield mask
+
+
+def _searched(most: int, test: EvaluationSweeps) -> int:
+    """How many of `most` sweeps or places are searched, fewer for LARGE windows."""
+    return max(MOST, round(most * min(1.0, LARGE / test.sweeps.samples[0].size)))
 
 
 def _count(mask: Array) -> str:
