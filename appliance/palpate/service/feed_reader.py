@@ -65,8 +65,8 @@ def _request(line: bytes) -> FeedRequest:
         return typed(FeedRequest, asked)
     except (ValueError, TypeError, AttributeError, RecursionError) as e:
         raise FormatError(
-            f'{_shown(line)} is not a request; send json: {{"frames": HZ}}, 0 to {MOST_HZ:g} a '
-            'second, or {"sweeps": true or false}'
+            f'{_shown(line)} is not a request; send json: {{"frames": HZ}}, from 0 to '
+            f'{MOST_HZ:g} a second, or {{"sweeps": true or false}}'
         ) from e
 
 
