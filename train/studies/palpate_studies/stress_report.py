@@ -103,7 +103,7 @@ def command(result: Json, name: str) -> str:
     words = ["python -m palpate_studies stress --set", result["train"]]
     if only := result.get("only"):
         words += ["--only", *(f"'{one}'" for one in only)]
-    words += ["--split", result["split"]] if result.get("split") else ["--test", result["test"]]
+    words += ["--split", result["split"]] if result.get("split") else []
     words += ["--method", ",".join(result["methods"]), "--seeds", str(len(result["seeds"]))]
     words += ["--out", f"docs/data/{name}.json"] if name != "stress" else []
     return " ".join(words)

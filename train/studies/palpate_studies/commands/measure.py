@@ -72,7 +72,12 @@ def run_rules(args: argparse.Namespace) -> None:
 def _add_stress(add: Add) -> None:
     command = add("stress", run_stress)
     options.add_set(command, "sim:T-REAL/level-blind:1")
-    _add_corrupted(command)
+    command.add_argument(
+        "--split",
+        metavar="GROUP:SHARE",
+        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
+        f"the rest instead of {STRESSED}, which is drawn anew",
+    )
     command.add_argument(
         "--method",
         default=STRESSED_METHODS,
@@ -86,22 +91,6 @@ def _add_stress(add: Add) -> None:
     add_out(command, "stress")
     options.add_effort(command)
     options.add_where(command)
-
-
-def _add_corrupted(command: argparse.ArgumentParser) -> None:
-    """The options of the corrupted set."""
-    command.add_argument(
-        "--test",
-        default=STRESSED,
-        metavar="SET",
-        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
-    )
-    command.add_argument(
-        "--split",
-        metavar="GROUP:SHARE",
-        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
-        "the rest instead of --test",
-    )
 
 
 def _add_certainty(add: Add) -> None:
@@ -118,10 +107,8 @@ def run_stress(args: argparse.Namespace) -> None:
     if args.split:
         train, rest = train.split(*options.group_share(args.split), 1)
         test = EvaluationSweeps.of(rest)
-    elif args.test.startswith("sim:"):
-        test = EvaluationSweeps.simulated(args.test)
     else:
-        test = EvaluationSweeps.of(sets.load(args.test).select(args.only))
+        test = EvaluationSweeps.simulated(STRESSED)
     with tempfile.TemporaryDirectory() as own:
         folder = _made_of(train, Path(own), log) if args.split else None
         box = _box_under_stress(folder, test, seeds, log)
