@@ -243,6 +243,7 @@ def test_a_row_of_the_number_of_frames_is_no_frame():
 
 @pytest.mark.parametrize(("text", "shown"), [("", "empty"), ("1^2^3\n" * 9, r"'1\^2\^3'")])
 def test_a_text_without_numbers_shows_one_of_its_lines(text: str, shown: str):
+    """The message holds a line as it stands, or says that there is none."""
     with pytest.raises(FormatError, match=shown):
         read(text)
 
