@@ -285,7 +285,8 @@ def _worst_places(bench: _Bench, most: int) -> Iterable[Array]:
 
 def _searched(most: int, test: EvaluationSweeps) -> int:
     """How many of `most` sweeps or places are searched, fewer for LARGE windows."""
-    return max(MOST, round(most * min(1.0, LARGE / test.sweeps.samples[0].size)))
+    share = min(1.0, LARGE / int(test.sweeps.samples[0].size))
+    return max(MOST, round(most * share))
 
 
 def _count(mask: Array) -> str:
