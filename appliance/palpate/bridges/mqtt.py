@@ -40,6 +40,8 @@ from palpate.core.retry import retried
 
 KEPT = 1000
 """Verdicts that wait for the broker; then the oldest is dropped and counted."""
+HEADER, LARGEST = 16, 268_435_455
+"""Most bytes of a message beside topic and content, and of one for which a broker sets no limit."""
 FLYING = 16
 """Messages that the broker has not acknowledged, at most; the others wait here, in order. paho
 would let more wait without a bound, verdicts behind all else. Brokers may allow fewer."""
@@ -106,7 +108,7 @@ class MqttBridge:
         self._waiting: deque[Waiting] = deque(maxlen=KEPT)
         self._heard = self._next = 0  # verdicts so far; number of the next to send
         self._flying: dict[int, int] = {}  # message id -> number of its verdict, -1 for another
-        self._most = FLYING
+        self._most, self._largest = FLYING, LARGEST
         self._said: dict[str, str] = {}  # what the retained topics hold
         self._refused = ""
         self._there = False
@@ -225,6 +227,7 @@ class MqttBridge:
         self._there = not why.is_failure
         self._refused = str(why).lower() if why.is_failure else ""
         self._most = min(FLYING, getattr(more, "ReceiveMaximum", FLYING))
+        self._largest = getattr(more, "MaximumPacketSize", LARGEST)
 
     def _disconnected(self, client: Any, data: Any, flags: Any, why: Any, more: Any) -> None:
         self._there = False
@@ -245,7 +248,14 @@ class MqttBridge:
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
         topic = f"homeassistant/device/palpate_{self._name}/config"
-        self._send(client, topic, config)
+        size = len(config.encode()) + len(topic) + HEADER
+        if size <= self._largest:
+            self._send(client, topic, config)
+        else:  # the broker would end the connection
+            self._log.warning(
+                f"mqtt: {self._broker} takes packets of {self._largest} bytes, the discovery has "
+                f"{size}: Home Assistant will not find the box; raise max_packet_size there"
+            )
         client.subscribe(self._heeded)
 
     def _publish(self, client: paho.Client) -> None:

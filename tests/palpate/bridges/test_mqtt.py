@@ -255,6 +255,22 @@ def test_a_broker_that_refuses_verdicts(tmp_path, box):
     assert one.last("/verdict") == ""
 
 
+@pytest.mark.slow
+def test_a_broker_that_takes_small_packets_alone(tmp_path, box, caplog):
+    """The discovery is left out, and said; verdicts come."""
+    required()
+    with (
+        Mosquitto(tmp_path, "max_packet_size 1000") as server,
+        Subscriber(server.port, "#") as one,
+        bridge("mqtt", *options(server, box)),
+    ):
+        online(box, one)
+        box.say(result(1))
+        eventually(lambda: one.last("/verdict") != "")
+    assert "max_packet_size" in caplog.text
+    assert one.last("/config") == ""
+
+
 def test_a_broker_that_takes_few_messages_at_a_time(box):
     """No more are under way than it allows; it would end the connection."""
     with socket.create_server(("127.0.0.1", 0)) as other:
