@@ -13,7 +13,7 @@ from palpate_train.data import sets
 from palpate_train.export import trial
 
 pytestmark = pytest.mark.slow  # the fixture answers each sweep without each rule
-SLIDES = "sim:T-REAL/level-blind:101:1"
+SLIDES, MOVED = "sim:T-REAL/level-blind:101:1", "sim:T-HARD/level-blind:101:1"
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,8 @@ def few() -> dict[tuple[str, ...], dict]:
     """The rows of a run on twelve slides, by what is left out."""
     tested = sets.load(SLIDES)
     tested = tested.take([i for i in range(len(tested)) if i % 9 in (0, 4)])
-    given = tested, None, 6, lambda line: None
+    moved = sets.load(MOVED)
+    given = tested, moved.take([*range(0, len(moved), 9)]), 6, lambda line: None
     found = rules_study.results(bundle.load(bundle.DEFAULT), *given)["rows"]
     return {tuple(row["without"]): row for row in found}
 
@@ -63,11 +64,10 @@ def test_the_command_writes_its_results(
 ):
     """With slides of other places as displaced ones."""
     out = tmp_path / "rules.json"
-    moved = "sim:T-HARD/level-blind:101:1"
-    for name, value in {"STRESSED": SLIDES, "MOVED": moved, "EACH": 1}.items():
+    for name, value in {"STRESSED": SLIDES, "MOVED": MOVED, "EACH": 1}.items():
         monkeypatch.setattr(f"palpate_studies.commands.measure.{name}", value)
     assert main(["rules", "--out", str(out)]) == 0
     found = json.loads(out.read_bytes())
-    assert found["sets"] == [SLIDES, moved]
+    assert found["sets"] == [SLIDES, MOVED]
     assert found["rows"][0]["total"]["displaced"] == 7
     assert "| hum |" in capsys.readouterr().out
