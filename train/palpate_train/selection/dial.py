@@ -30,8 +30,9 @@ from palpate_train.metrics.score import confusion, interval, row_shares
 from palpate_train.models.methods import Log
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
-from palpate_train.models.recipe.recipe import HeadChoice, Settings, Setup, Trunk
+from palpate_train.models.recipe.recipe import HeadChoice, Settings, Setup
 from palpate_train.models.recipe.sizes import SIZES, UNLIMITED, ModelSize
+from palpate_train.models.recipe.trunk import Trunk
 
 Array = NDArray[Any]
 Json = dict[str, Any]

@@ -22,7 +22,8 @@ from palpate_train.metrics import score
 from palpate_train.models.recipe import graph, recipe, relations
 from palpate_train.models.recipe.architectures import STAGES, Architecture
 from palpate_train.models.recipe.bank import POOLS, Bank
-from palpate_train.models.recipe.recipe import FIXED, Settings, Trunk
+from palpate_train.models.recipe.recipe import FIXED, Settings
+from palpate_train.models.recipe.trunk import Trunk
 from palpate_train.onnx_tools.graph_builder import slim, with_head
 
 Array = NDArray[Any]
