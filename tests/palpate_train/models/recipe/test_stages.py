@@ -372,7 +372,13 @@ def test_positions_are_held_out_where_there_are_several():
 
 @pytest.mark.slow
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
-    """Weights that do not fit the file's architecture are refused."""
+    """Weights that do not fit the file's architecture are refused, and an unknown change of the
+    sweeps."""
+    unknown = json.loads(json.dumps(fitted.about))
+    unknown["recipe"]["augmentation"]["twisted"] = 0.5
+    replace(fitted, about=unknown).save(tmp_path / "fit.npz")
+    with pytest.raises(FormatError, match="twisted"):
+        Fit.load(tmp_path / "fit.npz")
     replace(fitted, architecture=SMALL).save(tmp_path / "fit.npz")
     with pytest.raises(FormatError, match=r"8, 8\).*; fit again$"):
         Fit.load(tmp_path / "fit.npz")

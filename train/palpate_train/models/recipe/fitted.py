@@ -220,6 +220,7 @@ class Fit:
             named(arrays, prefix) for prefix in ("weight_", "calibration_", "contacts_")
         )
         shape, ranges = meta["architecture"], meta["ranges"]
+        Augmentation(**meta["about"]["recipe"]["augmentation"])  # as `augmentation` will, later
         return cls(
             weights,
             meta["scale"],
