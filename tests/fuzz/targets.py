@@ -232,7 +232,7 @@ def requests(data: bytes, folder: Path) -> None:
     assert len(got) == len(lines)
     assert rest == last
     for asked in got:
-        assert asked.frames_hz is None or 0 <= asked.frames_hz <= 20
+        assert asked.frames is None or 0 <= asked.frames <= 20
         assert asked.sweeps in (None, True, False)
         assert asked != feed_reader.FeedRequest()
     for cut in cuts(data):
