@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from palpate.answer.objects import softmax
-from palpate_train.metrics.temperature import platt_temperature, sufficient_temperature
+from palpate_train.metrics.temperature import (
+    platt_temperature,
+    sufficient_temperature,
+    weighted_platt_temperature,
+)
 
 
 def drawn(n: int, groups: int, seed: int = 0, scale: float = 2.0):
@@ -51,3 +55,18 @@ def test_one_wrong_sweep_or_group_asks_for_little():
     apart_temperature = sufficient_temperature(logits, labels, apart)
     assert sufficient_temperature(logits, labels, together) < apart_temperature
     assert apart_temperature > 1.2
+
+
+@pytest.mark.parametrize(("scale", "low", "high"), [(3.0, 2.5, 3.5), (0.2, 0.1, 0.3)])
+def test_a_weighted_temperature_is_found_above_and_below_one(scale: float, low: float, high: float):
+    """Calibrated logits times a factor give about that factor."""
+    logits, labels, _ = drawn(3000, 30)
+    found = weighted_platt_temperature(scale * logits, labels, np.full(3000, 1 / 3000))
+    assert low < found < high
+
+
+def test_logits_that_no_temperature_cools_get_the_highest():
+    """All temperatures cost the same there: the answer is as unsure as it can be."""
+    labels = np.arange(60) % 3
+    found = weighted_platt_temperature(1e7 * np.eye(3)[labels], labels, np.full(60, 1 / 60))
+    assert found > 50
