@@ -152,6 +152,13 @@ def test_text_and_bytes_between_frames_are_refused():
         read(HEAD + BODY + f"1,{'x' * 262144},3,4\n" + BODY)
 
 
+def test_a_column_of_notes_refuses_no_frame():
+    """A mark in a column that is blank else stands on a frame: its numbers are read."""
+    lines = [f"{'tap' if i == 30 else ''},{i},{i + 1},{i + 2}" for i in range(60)]
+    table = read("note,a,b,c\n" + "\n".join(lines) + "\n")
+    np.testing.assert_array_equal(table.values[:, 1:], np.arange(60)[:, None] + np.arange(3))
+
+
 @pytest.mark.parametrize("at", [0, 2, 4])
 @pytest.mark.parametrize("text", ["wood", "2026-01-01 12:00:00.{:03}", "skin_frame", '"a, b"'])
 def test_a_text_column_stands_beside_numbers(at: int, text: str):
