@@ -447,8 +447,9 @@ def _columns(
                 f"line {i} has {len(found[-1])} columns, line {rows[0][0]} has {layout.wide}; "
                 "write one row for each frame"
             )
-        others = [found[0][0], *(found[-1][c] for c in layout.numbers[1:])]
-        if _is_summary(found[-1], layout) and all(map(is_number, others)):
+        if _is_summary(found[-1], layout) and all(
+            map(is_number, (found[0][0], *(found[-1][c] for c in layout.numbers[1:])))
+        ):
             raise FormatError(
                 f"line {i} begins with {excerpt(found[-1][0])}, where other lines have a number; "
                 "leave it out"
