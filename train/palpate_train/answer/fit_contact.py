@@ -21,6 +21,7 @@ from palpate.core.types import normal
 from palpate.sim import skin
 from palpate_train.answer import embedding
 from palpate_train.data.sets import Dataset
+from palpate_train.data.thinning import evenly
 
 Array = NDArray[Any]
 BASELINE = 0.5
@@ -185,8 +186,8 @@ def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
     member = np.unique(position, return_inverse=True)[1]
     centres = np.stack([points[member == p].mean(axis=0) for p in range(member.max() + 1)])
     reach = embedding.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0
-    evenly = np.linspace(0, len(centres) - 1, min(len(centres), MOST_POSITIONS)).round().astype(int)
-    return ContactCentres(centres[evenly], max(MIN_LIMIT, reach))
+    some = evenly(len(centres), MOST_POSITIONS)
+    return ContactCentres(centres[some], max(MIN_LIMIT, reach))
 
 
 def farthest(points: Array, member: Array, centres: Array) -> Array:

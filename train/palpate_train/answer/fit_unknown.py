@@ -28,6 +28,7 @@ from palpate_train.answer.embedding import (
     shapes_of,
     within,
 )
+from palpate_train.data.thinning import evenly
 from palpate_train.metrics.tolerances import LEFT_OUT
 
 Array = NDArray[Any]
@@ -144,7 +145,7 @@ class Scatters:
         k, areas = len(self.own), []
         away = judged.z[:, None] - self.space.means
         untrained = shaped_distances(away, shapes_of(within(self.own, self.space.untrained)))
-        for number in np.unique(np.linspace(0, k - 1, min(k, LEFT_OUT)).round().astype(int)):
+        for number in np.unique(evenly(k, LEFT_OUT)):
             others, unknown = np.delete(np.arange(k), number), judged.labels == number
             shapes = shapes_of(within(self.own[others], self.space.trained(number)))
             trained = shaped_distances(away[:, others], shapes)

@@ -21,6 +21,7 @@ from palpate.answer.unknown import Known, shaped_distances
 from palpate.core.errors import FormatError
 from palpate.core.statistics import interval
 from palpate.sweeps.sweep_folder import NOT_THIS
+from palpate_train.data.thinning import evenly
 from palpate_train.metrics.tolerances import KEPT, LEFT_OUT
 
 Array = NDArray[Any]
@@ -260,8 +261,7 @@ def nearest_other(
     distances = np.full(len(z), np.nan)
     if len(means) < 2:
         return distances
-    spread = np.linspace(0, len(means) - 1, min(len(means), LEFT_OUT)).round().astype(int)
-    for k in np.intersect1d(spread, labels):
+    for k in np.intersect1d(evenly(len(means), LEFT_OUT), labels):
         own, others = labels == k, np.delete(means, k, axis=0)
         distances[own] = shaped_distances(z[own][:, None] - others, shapes_without(k)).min(axis=1)
     return distances

@@ -1,4 +1,4 @@
-"""Fewer sweeps of a large set, so that a fit needs no more memory and time for more of them.
+"""Fewer sweeps of a large set, taxels or materials, so that more of them cost a fit no more.
 
 Windows of one recording resemble each other, so recordings lose windows before a recording is lost.
 """
@@ -35,6 +35,11 @@ def thinned(sweeps: Dataset, most: int) -> Dataset:
         for start, n, few in zip(starts, _counts(numbers), quotas, strict=True):
             kept.append(own[order[start + (np.arange(few) * n) // max(few, 1)]])
     return sweeps.take(np.sort(np.concatenate(kept)))
+
+
+def evenly(n: int, most: int) -> Array:
+    """Numbers below `n`, at most `most` of them, at equal distances."""
+    return np.linspace(0, n - 1, min(n, most)).round().astype(int)
 
 
 def _counts(values: Array) -> Array:

@@ -17,6 +17,7 @@ from palpate.core.errors import FormatError
 from palpate_train.answer.heads import fit_discriminant
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
+from palpate_train.data.thinning import evenly
 from palpate_train.data.transforms import log_powers
 from palpate_train.metrics.score import accuracy_figure
 
@@ -107,8 +108,3 @@ def scaled(x: Array) -> Array:
         return np.zeros((len(x), 1))
     found: Array = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
     return found + DITHER * np.random.default_rng(0).standard_normal(found.shape)
-
-
-def evenly(n: int, most: int) -> Array:
-    """Numbers below `n`, at most `most` of them, at equal distances."""
-    return np.linspace(0, n - 1, min(n, most)).round().astype(int)
