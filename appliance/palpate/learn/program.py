@@ -150,7 +150,8 @@ class RecordingPhase(Phase):
         stack.callback(self._recording.close)
         self._session = session = self._lesson(say)
         stack.callback(session.close)
-        self._teacher = Teacher(session, () if again else lesson.labels, lesson.good)
+        taught = () if again else lesson.labels
+        self._teacher = Teacher(session, self._recording, taught, lesson.good)
         check = SweepCheck(program.format, devices.clock, self._slides(), teaching=True)
         self.box = assembly.assembled(
             *(settings, check, devices, port, stack),

@@ -313,29 +313,48 @@ def _about(suspect: Mapping[str, Any]) -> tuple[str, ...]:
 
 class Teacher(Observer):
     """Leads through the materials of a session without a page: asks for `sweeps` good sweeps of
-    each label, one after another. It must come after the session among the observers. done: true
-    once all sweeps are stored; false for ever without labels."""
+    each label, one after another. Sweeps that are still being written count, so that a slow disk
+    gives no label to sweeps of the next material; where one cannot be stored, its label is asked
+    for again at the end. It must come after the session among the observers. done: true once all
+    sweeps are stored; false for ever without labels."""
 
-    def __init__(self, session: TeachingSession, labels: Sequence[str], sweeps: int) -> None:
-        self._session, self._left, self._sweeps = session, [*labels], sweeps
-        self._label, self._wanted = "", 0
+    def __init__(
+        self,
+        session: TeachingSession,
+        recording: RecordingSession,
+        labels: Sequence[str],
+        sweeps: int,
+    ) -> None:
+        self._session, self._recording = session, recording
+        self._left, self._sweeps = [*labels], sweeps
+        self._wanted: dict[str, int] = {}  # sweeps of each label so far, the last in hand
         self.done = False
 
     def turn(self, health: Health) -> None:
         """Go on with the next material if this material is complete."""
-        if not self._complete:
+        if (not self._left and not self._wanted) or self._lacks([*self._wanted][-1:]):
             return
         if self._left:
-            self._label = self._left.pop(0)
-            self._wanted = self._session.materials().get(self._label, 0) + self._sweeps
-            self._session.commands["TEACH"](self._label)
-            log.info(f"teach: now {self._label}: {self._sweeps} sweeps")
-        elif self._label:
+            self._ask(self._left.pop(0))
+            return
+        self._recording.settle()
+        if again := self._lacks(self._wanted):
+            self._ask(again[0])
+        else:
             self.done = True
 
-    @property
-    def _complete(self) -> bool:
-        if not self._label:
-            return True
-        held = self._session.materials().get(self._label)  # None: forgotten, or renamed
-        return held is None or held >= self._wanted
+    def _ask(self, label: str) -> None:
+        held = self._session.materials().get(label, 0)
+        wanted = self._wanted.pop(label, held + self._sweeps)
+        self._wanted[label] = wanted
+        self._session.commands["TEACH"](label)
+        log.info(f"teach: now {label}: {wanted - held} sweeps")
+
+    def _lacks(self, labels: Iterable[str]) -> list[str]:
+        """Those of the labels that want more sweeps; not one that was forgotten, or renamed."""
+        held, coming = self._session.materials(), self._recording.coming
+        return [
+            label
+            for label in labels
+            if label in held and held[label] + coming(label) < self._wanted[label]
+        ]

@@ -78,7 +78,8 @@ class RecordingSession(Observer):
     ) -> None:
         self.names = names or TypedNames()
         self._disk = disk or AtOnce()
-        self._writing: dict[int, str] = {}  # number and material of each sweep that is not put yet
+        # each sweep that is not put yet: its material, and whether it will count
+        self._writing: dict[int, tuple[str, bool]] = {}
         try:
             self._folder = SweepFolder(folder, format)
         except OSError as e:
@@ -148,6 +149,14 @@ class RecordingSession(Observer):
         kept = (labels.material for _, labels in sorted(self._counted.items()) if labels.material)
         return dict(Counter(kept))
 
+    def coming(self, material: str) -> int:
+        """The number of its sweeps that are being written and will count."""
+        return sum(held == (material, True) for held in self._writing.values())
+
+    def settle(self) -> None:
+        """Wait until all sweeps are written, for some seconds at most."""
+        self._disk.settle()
+
     def refuse_while_changing(self) -> None:
         """Raises ApplianceError while such a change is not on the disk yet."""
         if self._changes:
@@ -165,7 +174,7 @@ class RecordingSession(Observer):
         included; they stay in the folder. done: called when that is on the disk; returns the fields
         of the reply. Raises ApplianceError."""
         held = [n for n, labels in self._counted.items() if labels.material == material]
-        waiting = [n for n, label in self._writing.items() if label == material]
+        waiting = [n for n, (label, _) in self._writing.items() if label == material]
         numbers = *held, *waiting
 
         def forgotten() -> list[object]:
@@ -237,7 +246,8 @@ class RecordingSession(Observer):
         self._answered = True
         labels = self._labels_of(sweep)
         sweep = replace(sweep, **entries(labels))
-        self._writing[self._folder.run + sweep.id] = labels.material
+        counts = bool(len(sweep.frames)) and not verdict.status.faulty
+        self._writing[self._folder.run + sweep.id] = labels.material, counts
         report = partial(self._report_outcome, sweep, verdict, labels)
         if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
             report(("failed", "the disk is too slow"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import sys
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from palpate.learn import process, session
 from palpate.learn.process import TeachingProcess
 from palpate.learn.session import Teacher, TeachingSession
 from palpate.sim import skin
+from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import NOT_THIS
 from tests.factories.feeds import HEALTH, OK, cut
@@ -354,7 +357,7 @@ def test_sweeps_are_assessed_again_after_a_discard(taught):
 def test_the_teacher_leads_from_material_to_material(taught):
     """Each label until its sweeps are there, those of earlier sessions not counted."""
     taught.sweeps("pine", 1)
-    teacher = Teacher(taught.session, ["cork", "pine"], 2)
+    teacher = Teacher(taught.session, taught.recording, ["cork", "pine"], 2)
     teacher.turn(HEALTH)
     assert taught.recording.about()["material"] == "cork"
     taught.sweeps("cork", 2)
@@ -368,10 +371,58 @@ def test_the_teacher_leads_from_material_to_material(taught):
     assert teacher.done
 
 
+def test_a_slow_disk_gives_the_next_sweeps_no_label(tmp_path):
+    """The teacher goes on as soon as the last wanted sweep was answered, and ends with all."""
+    disk = SlowDisk()
+    one = Taught(tmp_path, disk=disk)
+    teacher = Teacher(one.session, one.recording, ["cork", "pine"], 2)
+    for material in ("cork", "pine"):
+        teacher.turn(HEALTH)
+        assert one.recording.about()["material"] == material
+        one.sweeps(material, 1, Status.NO_CONTACT)
+        one.sweeps(material, 2)
+        assert one.session.materials()[material] == 0
+    teacher.turn(HEALTH)
+    assert teacher.done
+    assert one.session.materials() == {"cork": 2, "pine": 2}
+    one.session.close()
+    one.recording.close()
+
+
+def test_the_teacher_asks_again_for_a_sweep_that_could_not_be_stored(tmp_path, monkeypatch):
+    """The disk was full for a moment; the label comes back at the end."""
+    disk = SlowDisk()
+    one = Taught(tmp_path, disk=disk)
+    teacher = Teacher(one.session, one.recording, ["cork", "pine"], 1)
+    teacher.turn(HEALTH)
+    one.sweeps("cork", 1)
+    with monkeypatch.context() as full:
+        full.setattr(sweep_folder, "save", mock.Mock(side_effect=OSError(errno.ENOSPC, "full")))
+        disk.settle()
+    assert one.session.materials() == {"cork": 0}
+    teacher.turn(HEALTH)
+    one.sweeps("cork", 1)
+    teacher.turn(HEALTH)
+    one.sweeps("pine", 1)
+    with monkeypatch.context() as full:
+        full.setattr(sweep_folder, "save", mock.Mock(side_effect=OSError(errno.ENOSPC, "full")))
+        teacher.turn(HEALTH)
+    assert not teacher.done
+    assert one.recording.about()["material"] == "cork"
+    one.sweeps("cork", 1)
+    teacher.turn(HEALTH)
+    one.sweeps("pine", 1)
+    teacher.turn(HEALTH)
+    assert teacher.done
+    assert one.session.materials() == {"cork": 1, "pine": 1}
+    one.session.close()
+    one.recording.close()
+
+
 @pytest.mark.parametrize("order", [("FORGET", "cork"), ("RENAME", "cork,oak")])
 def test_the_teacher_goes_on_from_a_material_that_is_gone(taught, order: tuple[str, str]):
     """A label that a person has forgotten or renamed holds up none of the others."""
-    teacher = Teacher(taught.session, ["cork", "pine"], 2)
+    teacher = Teacher(taught.session, taught.recording, ["cork", "pine"], 2)
     teacher.turn(HEALTH)
     taught.order(*order)
     teacher.turn(HEALTH)
