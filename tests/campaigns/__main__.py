@@ -264,7 +264,7 @@ CAMPAIGNS = {
     ),
     "skins": _module(
         "measure emulated skins; the options name a part (way, noise, load) and skins: docs",
-        "tests.skins",
+        "tests.campaigns.skins",
         nice=True,
     ),
 }

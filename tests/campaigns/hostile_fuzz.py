@@ -35,8 +35,8 @@ from palpate.deployment.sandbox import run_limited
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import MOST_S, session
 from palpate_train.metrics.score import provenance
-from tests.factories.mutated_models import Own, mutated, own_models
 from tests.fuzz import mutated_enrolments
+from tests.fuzz.mutated_models import Own, mutated, own_models
 
 DEADLINE_S = 60.0
 MOST_MORE = 256 << 20

@@ -14,7 +14,7 @@ import numpy as np
 from palpate.bundle import bundle
 from palpate.bundle.enrolled import ARRAYS
 from tests.factories import deliveries
-from tests.factories.mutated_models import FLOATS, NUMBERS, flip
+from tests.fuzz.mutated_models import FLOATS, NUMBERS, flip
 
 LABELS = ("cork", "felt", "silk")
 

@@ -18,9 +18,9 @@ from palpate.core.errors import ConfigError
 from palpate.io import skin_profile
 from palpate.io.skin_codecs import Codec, Decoded, Rest, codec
 from palpate.io.skin_profile import SkinProfile
+from tests.campaigns.skins.noise import FAULTS
+from tests.campaigns.skins.subjects import PROFILES, subject
 from tests.fuzz.files import one_line
-from tests.skins.noise import FAULTS
-from tests.skins.subjects import PROFILES, subject
 
 MOST_REST = 70_000
 """Largest number of bytes that any codec may keep while it waits for more: some frames of the

@@ -32,12 +32,12 @@ from palpate.client.answers import Answer
 from palpate.core import storage
 from palpate.core.provenance import commit
 from palpate.sim import skin
+from tests.campaigns.skins.load import BOX, hurry
 from tests.factories.bridges import bridge
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
 from tests.robots import page
 from tests.robots.shared_line import SharedLine
-from tests.skins.load import BOX, hurry
 
 START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
 """Time for the boxes to start, for programs to attach, and between two samples of the processes."""

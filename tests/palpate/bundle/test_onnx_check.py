@@ -19,7 +19,7 @@ from palpate.deployment.sandbox import run_limited
 from palpate.inference.session import try_all
 from tests.campaigns import hostile_fuzz
 from tests.factories import hostile_models as hostile
-from tests.factories import mutated_models
+from tests.fuzz import mutated_models
 
 HOSTILE = hostile.every()
 MANIFEST = Manifest("hostile", "1", hostile.FORMAT, "raw", ("a", "b"), Thresholds(1, 255), {})

@@ -91,7 +91,7 @@ REPORTS = (
     ResultFile("overview", "overview.svg", ("palpate_studies", "overview")),
     ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
     ResultFile("bench", "data/bench.json", ("tests.campaigns", "bench")),
-    ResultFile("skins", "data/skins.json", ("tests.skins",)),
+    ResultFile("skins", "data/skins.json", ("tests.campaigns.skins",)),
     ResultFile(
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)
     ),

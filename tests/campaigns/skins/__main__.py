@@ -1,4 +1,4 @@
-"""`python -m tests.skins way|noise|load|page [SKIN ...]`: measures emulated skins, for
+"""`python -m tests.campaigns.skins way|noise|load|page [SKIN ...]`: measures emulated skins, for
 docs/data/skins.json and the tables of docs/skins.md.
 
 way: record, describe, fit, export and run with each skin. noise: wrong frames on a bad cable. load:
@@ -15,9 +15,9 @@ from typing import Any
 
 from palpate.core.provenance import commit
 from palpate_train.metrics import score
+from tests.campaigns.skins import load, noise, page, way
+from tests.campaigns.skins.subjects import NAMES, subject
 from tests.factories.paths import ROOT
-from tests.skins import load, noise, page, way
-from tests.skins.subjects import NAMES, subject
 
 WORK = ROOT / "build" / "skins"
 RESULTS = ROOT / "docs" / "data" / "skins.json"
@@ -41,7 +41,7 @@ def measured(part: str, name: str, seconds: float) -> dict[str, Any]:
 
 def main() -> int:
     """Run the parts, and write their results beside earlier results of the others."""
-    parser = argparse.ArgumentParser(prog="python -m tests.skins", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.skins", description=__doc__)
     parser.add_argument("part", nargs="?", choices=[*PARTS, "page"], help="all by default")
     parser.add_argument(
         "skins", nargs="*", metavar="SKIN", help=f"from {', '.join(NAMES)}; all by default"

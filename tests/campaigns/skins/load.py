@@ -38,11 +38,11 @@ from palpate.runtime.loop import Box
 from palpate.sim import script
 from palpate.tools import pseudo_terminal
 from tests.campaigns.bench_process import drain
+from tests.campaigns.skins.subjects import PROFILES
 from tests.factories.skins import sweeps
 from tests.factories.skins.devices import on_wire
 from tests.factories.skins.player import Player
 from tests.factories.skins.wires import wire
-from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0
 """Time before the measurement, in which the skin is found and its rate measured."""
@@ -179,7 +179,7 @@ def _turns(box: Box, far_end: int, seconds: float) -> None:
 
 def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
     """Run the emulator in a process of its own; starts when its terminal exists."""
-    command = [sys.executable, "-m", "tests.skins.load", name, str(rate_hz), str(link)]
+    command = [sys.executable, "-m", "tests.campaigns.skins.load", name, str(rate_hz), str(link)]
     player = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     until = time.monotonic() + START_S
     while not link.exists():

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from numpy.random import Generator, default_rng
 
 from palpate.io.skin_codecs import Rest, codec
-from tests.skins.subjects import Subject
+from tests.campaigns.skins.subjects import Subject
 
 READ_BYTES = 701
 """Bytes of one read: not a multiple of any frame."""
