@@ -1,24 +1,18 @@
 """The study `recipe`: the cost of views, the views of sets, and their table."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate_studies import loads_table, recipe_page, recipe_views
+from palpate_studies import recipe_page, recipe_views
 from palpate_studies.study import StudyCase, StudyRun
 from palpate_train.data import sets
-from palpate_train.data.run import Run
-from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.export import measure
-from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.architectures import Architecture
 from palpate_train.models.recipe.bank import POOLS
-from palpate_train.models.recipe.recipe import Settings
-from palpate_train.models.recipe.sizes import UNLIMITED
 
 RESULTS: dict[str, Any] = {
     "views": [
@@ -88,61 +82,3 @@ def test_the_table_has_a_row_for_each_view_with_its_sets():
     assert rows[3].endswith("| all 2 |")
     assert rows[-1].endswith("| 7 fabrics |")
     assert rows[0].endswith("| no set |")
-
-
-class LoadsFits:
-    """Stands for fits of one position each: a fit may have chosen loads, and its answers say so."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, chosen: bool) -> None:
-        self.made: list[tuple[int, bool]] = []
-        self._chosen = chosen
-        monkeypatch.setattr(loads_table.recipe, "fit", self.fit)
-        monkeypatch.setattr(loads_table, "answers", self.answers)
-
-    def fit(self, sweeps: Dataset, seed: int, settings: Settings) -> Any:
-        self.made.append((len(sweeps), settings.size.loads))
-        loads = settings.size.loads and self._chosen
-        return SimpleNamespace(architecture=replace(Architecture(()), loads=loads))
-
-    def answers(self, made: Any, test: Dataset) -> dict[str, np.ndarray]:
-        right = np.full(len(test), made.architecture.loads)
-        return {"label": np.ones(len(test), bool), "right": right, "wrong": ~right}
-
-
-@pytest.mark.slow
-def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
-    """A fit without loads beside each that chose them."""
-    fits = LoadsFits(monkeypatch, chosen=True)
-    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
-    found = list(loads_table.rows(lambda line: None))
-    assert [(row["world"], row["condition"], row["sweeps"]) for row in found] == [
-        (world, condition, sweeps)
-        for world in ("laboratory", "level-blind")
-        for condition, sweeps in (("skin put back", 12), ("new position", 180))
-    ]
-    assert fits.made == 2 * ([(540, True), (540, False)] + 3 * [(480, True), (480, False)])
-    for row in found:
-        assert row["with"] == {"label": 100, "right": 100, "wrong": 0}
-        assert row["without"] == {"label": 100, "right": 0, "wrong": 100}
-
-
-@pytest.mark.slow
-def test_loads_that_no_fit_chose_have_no_figures(monkeypatch: pytest.MonkeyPatch):
-    """Each fit is made once then."""
-    fits = LoadsFits(monkeypatch, chosen=False)
-    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
-    found = list(loads_table.rows(lambda line: None))
-    assert len(fits.made) == 8
-    assert all(row["with"] is None and row["without"]["wrong"] == 100 for row in found)
-
-
-@pytest.mark.thorough  # exports a bundle; the other tests have the rows
-def test_answers_are_those_of_the_box(monkeypatch: pytest.MonkeyPatch):
-    """A fit without loads, and the box's answers to its own sweeps: most are right."""
-    tubes = sets.load("sim:T-REAL:1").select(["position<=2"])
-    made = recipe.fit(tubes, Run(1), Settings(size=replace(UNLIMITED, loads=False)))
-    assert not made.architecture.loads
-    found = loads_table.answers(made, tubes)
-    assert found["label"].mean() > 0.95
-    assert found["right"].mean() > 0.9
-    assert not (found["right"] & found["wrong"]).any()

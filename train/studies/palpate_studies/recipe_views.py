@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.inference.session import session
-from palpate_studies import loads_table
 from palpate_studies.development_experiment import CASES
 from palpate_studies.study import NO_DATA, StudyRun
 from palpate_train.data import sets
@@ -36,14 +35,12 @@ FILTERS = 256
 
 
 def results(run: StudyRun) -> Json:
-    """`views` with their cost, `sets` with the views that the recipe chose there, and `loads`, see
-    loads_table.rows."""
+    """`views` with their cost, and `sets` with the views that the recipe chose there."""
     sweeps = sets.load(TIMED)
     return {
         "format": str(sweeps.format),
         "views": list(costs(sweeps)),
         "sets": list(choices(run)),
-        "loads": list(loads_table.rows(run.log)),
         "left_out": run.left_out,
         "seeds": [SEED],
     } | score.provenance()
