@@ -26,7 +26,7 @@ from palpate.service import network
 
 def run_mqtt(args: argparse.Namespace) -> int:
     """`palpate bridge mqtt`, until SIGTERM. Raises ConfigError without paho or a broker."""
-    with needed("the MQTT client", "mqtt"):
+    with needed("the MQTT client", "mqtt", "urllib.request"):
         from palpate.bridges import mqtt
         from palpate.bridges.mqtt_broker import broker
         from palpate.bridges.results import Results

@@ -7,8 +7,10 @@ takes 40 MiB and three seconds less (measured with asyncua 2.1.0).
 
 from __future__ import annotations
 
+import ctypes
 import gc
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,8 @@ class SmallServer(InternalServer):  # type: ignore[misc]
             getattr(part, f"create_{path.stem.replace('services', 'Services')}")(nodes)
         nodes.end()
         gc.collect()
+        with suppress(OSError, AttributeError):  # another C library than glibc
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Wanted:

@@ -4,9 +4,13 @@ bridge."""
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 from palpate.core.config import Config, SerialConfig, StoreConfig
 from palpate.core.errors import ConfigError
@@ -144,10 +148,30 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         )
 
 
+class _Later(ModuleType):
+    """Stands in for a module that is loaded at its first use."""
+
+    def __getattr__(self, name: str) -> Any:
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+        return getattr(import_module(self.__name__), name)
+
+
 @contextmanager
-def needed(what: str, extra: str) -> Iterator[None]:
-    """Raises ConfigError if an import fails: `what` is not installed, and `extra` has it."""
+def needed(what: str, extra: str, *hardly: str) -> Iterator[None]:
+    """Raises ConfigError if an import fails: `what` is not installed, and `extra` has it. hardly:
+    modules that it imports for what no bridge does; they take 2 MiB."""
+    absent = [_Later(name) for name in hardly if name not in sys.modules]
+    for one in absent:
+        above, _, own = one.__name__.rpartition(".")
+        sys.modules[one.__name__] = one
+        if above:
+            setattr(import_module(above), own, one)
     try:
         yield
     except ImportError as e:
         raise ConfigError(f"{what} is not installed ({e}); pip install 'palpate[{extra}]'") from e
+    finally:
+        for one in absent:
+            if sys.modules.get(one.__name__) is one:
+                del sys.modules[one.__name__]

@@ -41,7 +41,7 @@ def _modbus(args: argparse.Namespace) -> Served:
 
 
 def _opcua(args: argparse.Namespace) -> Served:
-    with needed("the OPC UA server", "opcua"):
+    with needed("the OPC UA server", "opcua", "anyio", "pickle", "shelve", "xml.etree.ElementTree"):
         from palpate.bridges.opcua import Offer, OpcuaBridge
 
     offer = Offer(

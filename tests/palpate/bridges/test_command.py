@@ -11,11 +11,12 @@ import socket
 import subprocess
 import sys
 import tty
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from palpate.bridges.options import LINKS, PORTS, add_arguments, settle
+from palpate.bridges.options import LINKS, PORTS, add_arguments, needed, settle
 from palpate.bridges.source import warn_of
 from palpate.core import config
 from palpate.core.errors import ConfigError
@@ -122,3 +123,32 @@ def test_options_that_do_not_fit(options):
     with pytest.raises(SystemExit) as ended:
         settled(*options)
     assert ended.value.code == 2
+
+
+def test_a_module_that_a_library_hardly_uses(tmp_path, monkeypatch):
+    """It is loaded at its first use, and by the next import of another."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hardly").mkdir()
+    for name in ("used", "unused"):
+        (tmp_path / "hardly" / f"{name}.py").write_text("VALUE = 1")
+    with needed("a library", "extra", "hardly.used", "hardly.unused"):
+        from hardly import unused, used
+    assert not {"hardly.used", "hardly.unused"} & {*sys.modules}
+    assert used.VALUE == 1
+    assert "hardly.used" in sys.modules
+    assert import_module("hardly.unused") is not unused
+    assert unused.VALUE == 1
+
+
+@pytest.mark.parametrize("kind", ["mqtt", "opcua"])
+def test_modules_that_the_bridges_leave_out(kind, tmp_path):
+    """They take more than a MiB, and no bridge needs them."""
+    pytest.importorskip({"mqtt": "paho.mqtt", "opcua": "asyncua"}[kind])
+    own = {"mqtt": ("--broker", "none"), "opcua": ("--folder", str(tmp_path))}[kind]
+    words = [kind, "--feed", "none", *own]
+    code = "import sys; from palpate.bridges import command\n"
+    code += f"print(command.main({words}), [*sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert ran.stdout.startswith("78 "), ran.stderr
+    assert f"'palpate.bridges.{kind}'" in ran.stdout
+    assert not [m for m in ("'http.client'", "'shelve'", "'anyio'") if m in ran.stdout]
