@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from palpate.bridges.options import MOST, PORTS, add_arguments, needed, settle
-from palpate.bridges.source import source_of, warn_of
+from palpate.bridges.source import warn_of
 from palpate.client.feed import Feed
 from palpate.client.line import Line, open_port
 from palpate.core import config, sentences
@@ -29,17 +29,12 @@ def run_mqtt(args: argparse.Namespace) -> int:
     with needed("the MQTT client", "mqtt", "urllib.request"):
         from palpate.bridges import mqtt
         from palpate.bridges.mqtt_broker import broker
-        from palpate.bridges.results import Results
 
     settle("mqtt", args, config.load(None))
     name, stopped = network.box_name(args.name), StopFlag()
     warn_of(args)
-    bridge = mqtt.MqttBridge(
-        *(broker(args.broker, args.login, args.ca), name, partial(source_of, args)),
-        *(SystemClock(), stopped),
-        results=Results(args.memory),
-        writes=args.allow_writes,
-    )
+    to = broker(args.broker, args.login, args.ca)
+    bridge = mqtt.MqttBridge(to, name, args, SystemClock(), stopped)
     says = "are passed on" if args.allow_writes else "are refused (--allow-writes)"
     log.info(f"mqtt: box at {bridge.source.name}, topics palpate/{name}; commands {says}")
     try:

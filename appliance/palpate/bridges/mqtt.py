@@ -14,9 +14,10 @@ import select
 import socket
 import ssl
 import threading
+from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -29,7 +30,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from palpate.bridges.mqtt_broker import Broker
 from palpate.bridges.mqtt_content import discovery, state, verdict
 from palpate.bridges.results import Results
-from palpate.bridges.source import COMMANDS, Source
+from palpate.bridges.source import COMMANDS, source_of
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
 from palpate.core import wall_clock
@@ -70,43 +71,25 @@ BROKEN = (OSError, ValueError, TypeError, LookupError, AttributeError)
 """What paho raises for packets that are none, and for a connection that is not to be had."""
 
 
-@dataclass(frozen=True, slots=True)
-class Waiting:
-    """A verdict that the broker has not acknowledged. number: counts all verdicts."""
-
-    number: int
-    heard_ns: int
-    fields: Mapping[str, Any]
-
-
 class MqttBridge:
-    """Publishes the news of `source(heard)` at the broker, answers questions for `results`, and
-    takes commands if `writes`.
-
-    name: of the box, in topics. stopped: whether the program is to end.
-    """
+    """Publishes the news of the box at the broker, and answers. name: of the box, in topics. args:
+    completed by `settle`. stopped: whether the program is to end."""
 
     def __init__(
-        self,
-        broker: Broker,
-        name: str,
-        source: Callable[[Callable[[Heard], None]], Source],
-        clock: Clock,
-        stopped: Callable[[], bool],
-        *,
-        results: Results,
-        writes: bool,
+        self, broker: Broker, name: str, args: Namespace, clock: Clock, stopped: Callable[[], bool]
     ) -> None:
         self.dropped = 0
         self._broker, self._name, self._base = broker, name, f"palpate/{name}"
-        self._clock, self._stopped, self._writes = clock, stopped, writes
-        self._results = results
+        self._clock, self._stopped, self._writes = clock, stopped, args.allow_writes
+        self._results = Results(args.memory)
         # each at most once: a late START would be a wrong one
-        self._heeded = [(f"{self._base}/{one}", 0) for one in ("since", "command")[: 1 + writes]]
+        heeded = ("since", "command")[: 1 + self._writes]
+        self._heeded = [(f"{self._base}/{topic}", 0) for topic in heeded]
         self._log = SparseLog(clock.now_ns)
         self._lock = threading.Lock()
-        self._waiting: deque[Waiting] = deque(maxlen=KEPT)
-        self._heard = self._next = 0  # verdicts so far; number of the next to send
+        # verdicts that the broker has not acknowledged, and when they were heard
+        self._waiting: deque[tuple[int, Mapping[str, Any]]] = deque(maxlen=KEPT)
+        self._first = self._next = 0  # numbers of the first that waits and of the next to send
         self._flying: dict[int, int] = {}  # message id -> number of its verdict, -1 for another
         self._most, self._largest = FLYING, LARGEST
         self._said: dict[str, str] = {}  # what the retained topics hold
@@ -119,7 +102,7 @@ class MqttBridge:
         self._woken, self._wakes = socket.socketpair()
         for end in (self._woken, self._wakes):
             end.setblocking(False)
-        self.source = source(self._take)
+        self.source = source_of(args, self._take)
 
     def close(self) -> None:
         """Close the connection to the box."""
@@ -134,25 +117,21 @@ class MqttBridge:
             fields = {"time": wall_clock.date(), **verdict(news)}
             self._results.add(wall_clock.seconds(), news)
             with self._lock:
-                self.dropped += len(self._waiting) == KEPT
-                self._waiting.append(Waiting(self._heard, self._clock.now_ns(), fields))
-                self._heard += 1
+                full = len(self._waiting) == KEPT
+                self.dropped, self._first = self.dropped + full, self._first + full
+                self._waiting.append((self._clock.now_ns(), fields))
         self._wake()
 
     def _wake(self) -> None:
-        try:
+        with suppress(OSError):  # full, so it wakes anyway; or closed
             self._wakes.send(b".")
-        except OSError:  # full, so it wakes anyway; or closed
-            return
 
     def session(self) -> None:
         """One connection, from the first try to its loss or the end of the program."""
         try:
             client = retried(self._connect, self._clock, self._stopped, always=True)
-        except AddressError:
-            if self._stopped():
-                return
-            raise
+        except AddressError:  # the program ends
+            return
         log.info(f"mqtt: connected to {self._broker}")
         self._next, self._said, self._deaf_ns = 0, {}, 0
         self._flying.clear()
@@ -178,15 +157,11 @@ class MqttBridge:
         client: paho.Client | None = None
         self._there, self._refused = False, ""
         end_ns = self._clock.now_ns() + round(CONNECT_S * 1e9)
-        properties = Properties(PacketTypes.CONNECT)
-        properties.MaximumPacketSize = MOST_BYTES
+        to, asks = self._broker, Properties(PacketTypes.CONNECT)
+        asks.MaximumPacketSize = MOST_BYTES
         try:
             client = self._client()
-            client.connect(
-                *(self._broker.host, self._broker.port, KEEPALIVE_S),
-                clean_start=True,
-                properties=properties,
-            )
+            client.connect(to.host, to.port, KEEPALIVE_S, clean_start=True, properties=asks)
             line: Any = client.socket()
             line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
             while not self._there and not self._refused and self._clock.now_ns() < end_ns:
@@ -199,16 +174,13 @@ class MqttBridge:
             return client
         _end(client)
         raise AddressError(
-            f"broker {self._broker}: {self._refused or f'no answer within {CONNECT_S:g} s'}; check "
+            f"broker {to}: {self._refused or f'no answer within {CONNECT_S:g} s'}; check "
             "its address, --login and --ca, and whether it speaks MQTT 5"
         )
 
     def _client(self) -> paho.Client:
         client = paho.Client(
-            CallbackAPIVersion.VERSION2,
-            client_id=f"palpate-{self._name}",
-            protocol=paho.MQTTv5,
-            reconnect_on_failure=False,
+            CallbackAPIVersion.VERSION2, f"palpate-{self._name}", protocol=paho.MQTTv5
         )
         client.connect_timeout = CONNECT_S
         if self._broker.user:
@@ -240,10 +212,11 @@ class MqttBridge:
         done = self._flying.pop(mid, None)
         if why.is_failure:
             self._log.warning(f"mqtt: {self._broker} refuses a message: {why}; see its rules")
-            self.dropped += done is not None and done >= 0
         with self._lock:
-            while done is not None and self._waiting and self._waiting[0].number <= done:
+            self.dropped += why.is_failure and done is not None and done >= 0
+            while done is not None and self._waiting and self._first <= done:
                 self._waiting.popleft()
+                self._first += 1
 
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
@@ -264,14 +237,13 @@ class MqttBridge:
         view = self.source.view()
         self._say(client, "status", "online" if view.alive(now_ns) else "offline")
         with self._lock:
-            first = self._waiting[0].number if self._waiting else self._heard
-            self._next = max(self._next, first)
-            at = self._next - first
+            self._next = max(self._next, self._first)
+            at = self._next - self._first
             due = [*islice(self._waiting, at, at + max(0, self._most - len(self._flying)))]
-        for one in due:
-            text = json.dumps({**one.fields, "late": now_ns - one.heard_ns > LATE_NS})
-            self._send(client, f"{self._base}/verdict", text, one.number)
-            self._next = one.number + 1
+        for heard_ns, fields in due:
+            text = json.dumps({**fields, "late": now_ns - heard_ns > LATE_NS})
+            self._send(client, f"{self._base}/verdict", text, self._next)
+            self._next += 1
         self._say(client, "state", json.dumps(state(view, self.dropped)))
         if self._deaf_ns and now_ns >= self._deaf_ns:
             self._deaf_ns = 0

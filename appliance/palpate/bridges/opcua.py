@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from asyncua import Server, ua
@@ -30,12 +29,12 @@ from palpate.bridges.opcua_model import (
     result,
     state,
 )
-from palpate.bridges.opcua_security import Login, hide_open_endpoint, limit, own_certificate
+from palpate.bridges.opcua_security import Login, limit, own_certificate
 from palpate.bridges.opcua_space import SmallServer
 from palpate.bridges.options import read_login
 from palpate.bridges.results import MOST, Results
 from palpate.bridges.server import CLOSE_S, not_listening
-from palpate.bridges.source import BoxView, Source
+from palpate.bridges.source import source_of
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
 from palpate.core import wall_clock
@@ -51,50 +50,33 @@ LOOK_S = 1.0
 """Longest time between two looks at the box."""
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
-    """folder: of the certificate and of `login`, user and password. memory: file of verdicts, if
-    there is one. name: of the box. most: connections at a time."""
-
-    folder: Path
-    memory: Path
-    name: str
-    most: int
-    writes: bool
-    anonymous: bool
-
-
 class OpcuaBridge:
-    """Serves the news of `source(heard)`; `open` it in the loop where it was made."""
+    """Serves the box; `open` it in the loop where it was made. name: of the box. args: completed by
+    `settle`."""
 
-    def __init__(
-        self, source: Callable[[Callable[[Heard], None]], Source], clock: Clock, offer: Offer
-    ) -> None:
-        login = offer.folder / "login"
+    def __init__(self, name: str, args: argparse.Namespace, clock: Clock) -> None:
+        login = args.folder / "login"
         user, password = read_login(login) if login.exists() else ("", "")
-        if not user and not offer.anonymous:
+        if not user and not args.anonymous:
             raise ConfigError(
                 f"{login}: there is no such file; put a user on its first line and a password on "
                 "its second, or let everybody read with --anonymous"
             )
         self.address = ("", 0)
-        self._clock, self._offer = clock, offer
+        self._name, self._args, self._clock = name, args, clock
         self._log = SparseLog(clock.now_ns)
         self._loop = asyncio.get_running_loop()
         self._news: deque[tuple[float, Answer]] = deque(maxlen=WAITING)
-        self._results = Results(offer.memory)
+        self._results = Results(args.memory)
         self._come, self._commanding = asyncio.Event(), asyncio.Lock()
-        self._result: dict[str, Any] = {}
-        self._at_s: float | None = None
         self._said: dict[str, tuple[Any, int]] = {}
         self._sweeping = False
         self._start_s: float | None = None
         self._nodes: dict[str, Node] = {}
-        users = Login(user, password, clock, anonymous=offer.anonymous)
+        users = Login(user, password, clock, anonymous=args.anonymous)
         self._server, self._users = Server(SmallServer(user_manager=users)), bool(user)
-        self._event: EventGenerator | None = None
         self.tasks: list[asyncio.Task[None]] = []
-        self.source = source(self._take)
+        self.source = source_of(args, self._take)
 
     async def close(self) -> None:
         """End all connections."""
@@ -105,29 +87,33 @@ class OpcuaBridge:
 
     async def open(self, host: str, port: int) -> None:
         """Make the nodes and listen. Raises AddressError or ConfigError as TcpServer does."""
-        server, offer = self._server, self._offer
-        certificate, key, uri = own_certificate(offer.folder, f"{URI}:{offer.name}", host)
+        server, args, title = self._server, self._args, f"Palpate {self._name}"
+        certificate, key, uri = own_certificate(args.folder, f"{URI}:{self._name}", host)
         await server.init()
         await server.set_application_uri(uri)
-        server.set_server_name(f"Palpate {offer.name}")
-        about = "Palpate", f"Palpate {offer.name}", __version__, ""
-        await server.set_build_info(URI, *about, wall_clock.utc())
+        server.set_server_name(title)
+        await server.set_build_info(URI, "Palpate", title, __version__, "", wall_clock.utc())
         await server.load_certificate(certificate, "der")
         await server.load_private_key(key, format="pem")
-        limit(server, offer.most, users=self._users, anonymous=offer.anonymous)
-        await self._add_variables(await server.register_namespace(URI))
-        await self._add_methods(await server.get_namespace_index(URI))
+        limit(server, args.most, users=self._users, anonymous=args.anonymous)
+        at = await server.register_namespace(URI)
+        await self._add_variables(at)
+        await self._add_methods(at)
+        fields = [(path.rpartition(".")[2], kind) for path, kind in RESULT.items()]
+        told = await server.create_custom_event_type(at, "ResultReadyEventType", properties=fields)
+        event = await server.get_event_generator(told)
         server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
         server.socket_address = host, port
         try:
             await server.start()
         except (OSError, OverflowError, ValueError) as e:
             raise not_listening(host, port, e) from e
-        if not offer.anonymous:
-            hide_open_endpoint(server)
+        if not args.anonymous:  # the end without encryption then serves discovery alone
+            ends = server.iserver.endpoints
+            ends[:] = [end for end in ends if end.SecurityMode != ua.MessageSecurityMode.None_]
         assert server.bserver
         self.address = server.bserver.hostname, server.bserver.port
-        self.tasks.append(asyncio.create_task(self._write_all()))
+        self.tasks.append(asyncio.create_task(self._write_all(event)))
 
     async def _add_variables(self, at: int) -> None:
         """Add the variables and the objects that hold them. at: index of the namespace."""
@@ -152,14 +138,10 @@ class OpcuaBridge:
         since = [argument("Since", date), argument("Most", count)]
         found = argument("Results", text, rank=1)
         await add("LastResult.GetResults", self._get_results, since, found)
-        for method, (command, tops) in METHODS.items() if self._offer.writes else ():
+        for method, (command, tops) in METHODS.items() if self._args.allow_writes else ():
             takes = [argument(name, ua.ObjectIds.Float) for name in tops]
             act = partial(self._command, command, tops)
             await add(f"VisionStateMachine.{method}", act, takes)
-        told = await self._server.create_custom_event_type(
-            at, "ResultReadyEventType", properties=[*RESULT.items()]
-        )
-        self._event = await self._server.get_event_generator(told)
 
     def _take(self, news: Heard) -> None:
         """News of the box, in the thread that reads it."""
@@ -174,8 +156,12 @@ class OpcuaBridge:
             self._start_s = at_s if news.sweeping else self._start_s
         self._come.set()
 
-    async def _write_all(self) -> None:
-        """Write the news as they come, and look whether the box is silent."""
+    async def _write_all(self, event: EventGenerator) -> None:
+        """Write the news as they come, with an event for each result, and look whether the box is
+        silent."""
+        last: Mapping[str, Any] = dict.fromkeys(RESULT)
+        at_s: float | None = None
+        none = CODES.BadWaitingForInitialData
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(LOOK_S):
@@ -184,31 +170,18 @@ class OpcuaBridge:
             view = self.source.view()
             alive = view.alive(self._clock.now_ns())
             while self._news:
-                await self._write_result(*self._news.popleft(), view)
+                at_s, answer = self._news.popleft()
+                last, none = result(answer, view, at_s, self._start_s), 0
+                self._start_s = None
+                self._results.add(at_s, answer)
+                await self._write(last, 0, at_s)
+                for path, value in last.items():
+                    setattr(event.event, path.rpartition(".")[2], value)
+                text = f"{answer.sweep}: {answer.status} {answer.label}"
+                await event.trigger(wall_clock.utc(at_s), text)
             silent = CODES.BadNoCommunication
             await self._write(state(view), 0 if alive else silent, None)
-            none = 0 if self._result else CODES.BadWaitingForInitialData
-            of_result = self._result or dict.fromkeys(RESULT)
-            await self._write(
-                {f"LastResult.{name}": value for name, value in of_result.items()},
-                none if alive else silent,
-                self._at_s,
-            )
-
-    async def _write_result(self, at_s: float, answer: Answer, view: BoxView) -> None:
-        """Write a result, and send its event. at_s: when it was heard."""
-        self._at_s = at_s
-        self._result = result(answer, view, at_s, self._start_s)
-        self._start_s = None
-        self._results.add(at_s, answer)
-        told = {f"LastResult.{name}": value for name, value in self._result.items()}
-        await self._write(told, 0, at_s)
-        if self._event:
-            for name, value in self._result.items():
-                setattr(self._event.event, name, value)
-            await self._event.trigger(
-                wall_clock.utc(at_s), f"{answer.sweep}: {answer.status} {answer.label}"
-            )
+            await self._write(last, none if alive else silent, at_s)
 
     async def _write(self, values: Mapping[str, Any], code: int, at_s: float | None) -> None:
         """Write the values that differ from the last ones. code: the quality; bad without a box, so

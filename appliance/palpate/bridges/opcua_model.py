@@ -31,29 +31,25 @@ STATE: Mapping[str, ua.VariantType] = {
     "RecipeManagement.InternalRecipeId": KINDS.String,
 }
 RESULT: Mapping[str, ua.VariantType] = {
-    "JobId": KINDS.UInt32,
-    "ResultState": KINDS.Int32,
-    "Status": KINDS.String,
-    "Material": KINDS.String,
-    "Label": KINDS.String,
-    "LabelCode": KINDS.UInt16,
-    "Probability": KINDS.Float,
-    "Margin": KINDS.Float,
-    "Reason": KINDS.String,
-    "InternalRecipeId": KINDS.String,
-    "StartTime": KINDS.DateTime,
-    "EndTime": KINDS.DateTime,
-    "CreationTime": KINDS.DateTime,
-    "ResultId": KINDS.String,
+    "LastResult.JobId": KINDS.UInt32,
+    "LastResult.ResultState": KINDS.Int32,
+    "LastResult.Status": KINDS.String,
+    "LastResult.Material": KINDS.String,
+    "LastResult.Label": KINDS.String,
+    "LastResult.LabelCode": KINDS.UInt16,
+    "LastResult.Probability": KINDS.Float,
+    "LastResult.Margin": KINDS.Float,
+    "LastResult.Reason": KINDS.String,
+    "LastResult.InternalRecipeId": KINDS.String,
+    "LastResult.StartTime": KINDS.DateTime,
+    "LastResult.EndTime": KINDS.DateTime,
+    "LastResult.CreationTime": KINDS.DateTime,
+    "LastResult.ResultId": KINDS.String,
 }
 """Variables of the last result, and fields of its event; ResultId is written last, so whoever reads
 the others after its change has those of one result."""
 REPLY = "VisionStateMachine.LastReply"
-VARIABLES = {
-    **STATE,
-    REPLY: KINDS.String,
-    **{f"LastResult.{name}": kind for name, kind in RESULT.items()},
-}
+VARIABLES = {**STATE, REPLY: KINDS.String, **RESULT}
 """All variables by their paths."""
 SLIDE = {"SpeedMmS": 10_000.0, "ForceN": 1000.0}
 """Arguments of Start with their largest values; 0: not known."""

@@ -11,8 +11,9 @@ import ctypes
 import gc
 from collections.abc import Iterable
 from contextlib import suppress
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import asyncua
@@ -28,47 +29,38 @@ class SmallServer(InternalServer):  # type: ignore[misc]
 
     async def load_standard_address_space(self, shelf_file: Path | None = None) -> None:
         """Called by the library."""
-        nodes = _Wanted(self.node_mgt_service)
+        wanted, service = _Wanted(), self.node_mgt_service
         # each by itself: the package would load all of them, and keep them
         for path in sorted(PARTS.glob("standard_address_space_services_*.py")):
-            spec = spec_from_file_location(path.stem, path)
-            assert spec
-            assert spec.loader
-            part = module_from_spec(spec)
-            spec.loader.exec_module(part)
-            getattr(part, f"create_{path.stem.replace('services', 'Services')}")(nodes)
-        nodes.end()
+            part = ModuleType(path.stem)
+            SourceFileLoader(path.stem, str(path)).exec_module(part)
+            getattr(part, f"create_{path.stem.replace('services', 'Services')}")(wanted)
+        nodes, before = wanted.nodes, -1
+        while before != len(nodes):  # until only those whose parent or type is left out are left
+            before, nodes = len(nodes), [*service.try_add_nodes(nodes, check=False)]
+        list(service.try_add_references(wanted.references))
+        del wanted, nodes
         gc.collect()
         with suppress(OSError, AttributeError):  # another C library than glibc
             ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Wanted:
-    """Adds the wanted nodes and the references between them. Nodes can come before their parents:
-    the rest is tried again at the end, and a node whose parent or type is left out is left out."""
+    """Keeps the wanted nodes and the references between them; nodes can come before their
+    parents."""
 
-    def __init__(self, service: Any) -> None:
-        self._service = service
-        self._nodes: list[Any] = []
-        self._references: list[Any] = []
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.references: list[Any] = []
 
     def add_nodes(self, nodes: Iterable[Any]) -> None:
         """Called by the library's lists."""
-        wanted = [node for node in nodes if _wanted(node.RequestedNewNodeId)]
-        self._nodes += self._service.try_add_nodes(wanted, check=False)
+        self.nodes += [node for node in nodes if _wanted(node.RequestedNewNodeId)]
 
     def add_references(self, references: Iterable[Any]) -> None:
         """Called by the library's lists."""
         both = (r for r in references if _wanted(r.SourceNodeId) and _wanted(r.TargetNodeId))
-        self._references += self._service.try_add_references(both)
-
-    def end(self) -> None:
-        """Add what waits for nodes that came later."""
-        before = -1
-        while before != len(self._nodes):
-            before = len(self._nodes)
-            self._nodes = [*self._service.try_add_nodes(self._nodes, check=False)]
-        list(self._service.try_add_references(self._references))
+        self.references += both
 
 
 def _wanted(node: Any) -> bool:

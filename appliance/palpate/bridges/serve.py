@@ -42,14 +42,9 @@ def _modbus(args: argparse.Namespace) -> Served:
 
 def _opcua(args: argparse.Namespace) -> Served:
     with needed("the OPC UA server", "opcua", "anyio", "pickle", "shelve", "xml.etree.ElementTree"):
-        from palpate.bridges.opcua import Offer, OpcuaBridge
+        from palpate.bridges.opcua import OpcuaBridge
 
-    offer = Offer(
-        *(args.folder, args.memory, network.box_name(args.name), args.most),
-        writes=args.allow_writes,
-        anonymous=args.anonymous,
-    )
-    bridge = OpcuaBridge(partial(source_of, args), SystemClock(), offer)
+    bridge = OpcuaBridge(network.box_name(args.name), args, SystemClock())
     return bridge, bridge.source.name, bridge.close
 
 
