@@ -49,11 +49,16 @@ with suppress(ModuleNotFoundError):  # a board has no Hypothesis
     hypothesis.settings.load_profile("any machine")
 
 
+HEAVY = {"torch", "sklearn", "scipy", "pandas", "zarr"}
+"""Libraries that take long to import."""
+COLLECTED = pytest.StashKey[set[str]]()
+
 gc.disable()  # until all tests are collected: each import would look through all modules before it
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish(session: pytest.Session) -> None:
     """Search new objects alone for garbage: the search took a fifth of the time."""
+    session.config.stash[COLLECTED] = HEAVY & sys.modules.keys()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
     gc.enable()
@@ -64,6 +69,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.relative_to(ROOT).parts[1] in ("rig", "systemd", "campaigns"):
             item.add_marker(pytest.mark.timeout(BUILDING_S))
+
+
+@pytest.fixture
+def heavy(pytestconfig: pytest.Config) -> set[str]:
+    """The libraries of HEAVY that this process had imported when its tests were collected."""
+    return pytestconfig.stash[COLLECTED]
 
 
 @pytest.hookimpl(wrapper=True)

@@ -77,7 +77,7 @@ def run(wheels: list[Path], program: str, folder: Path) -> str:
 
 @pytest.mark.slow
 def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
-    """Each holds one package, whose name nobody else has."""
+    """Each holds one package, whose name nobody else has; the box's has its bundle and licence."""
     tops = {
         name: {entry.partition("/")[0] for entry in zipfile.ZipFile(path).namelist()}
         for name, path in wheels.items()
@@ -87,6 +87,10 @@ def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
         "palpate_train": {"palpate_train"},
         "palpate_client": {"palpate"},
     }
+    names = zipfile.ZipFile(wheels["palpate"]).namelist()
+    held = ("default_bundle/model.onnx", "default_bundle/manifest.json", "web/page/watch.html")
+    assert {f"palpate/{name}" for name in held} <= set(names)
+    assert any(n.endswith("licenses/LICENSE") for n in names)
 
 
 @pytest.mark.slow
@@ -104,6 +108,23 @@ def test_box_and_desktop_beside_files_of_the_user(wheels: dict[str, Path], tmp_p
     told = run([wheels["palpate"], wheels["palpate_train"]], USES_BOTH, tmp_path)
     assert told.startswith(str(tmp_path))
     assert told.endswith("cork felt\n")
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # installs five libraries
+def test_the_box_in_a_clean_environment(wheels: dict[str, Path], tmp_path: Path):
+    """Locked dependencies and the wheel alone: `palpate check` on the rig says ok."""
+    python = tmp_path / "venv" / "bin" / "python"
+    pip = (python, "-m", "pip", "install", "-q", "--disable-pip-version-check")
+    for command in (
+        (sys.executable, "-m", "venv", tmp_path / "venv"),
+        (*pip, "--require-hashes", "-r", ROOT / "appliance" / "requirements.lock"),
+        (*pip, "--no-deps", wheels["palpate"]),
+    ):
+        subprocess.run(command, check=True, cwd=tmp_path, timeout=600)
+    check = [python.with_name("palpate"), "check", "--sim", "skin", "--virtual"]
+    out = subprocess.run(check, check=True, capture_output=True, text=True, timeout=600).stdout
+    assert out.count("ok  ") == 5
 
 
 @pytest.mark.slow
