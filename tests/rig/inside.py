@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib.metadata import distribution
 from pathlib import Path
 
-from tests.backends import Skin, skins
+from tests.rig.backends import Skin, skins
 from tests.rig.emulated_machines import ROOT
 from tests.rig.machine import Guest
 

@@ -4,7 +4,7 @@ import re
 import threading
 from pathlib import Path
 
-from tests.backends import remote
+from tests.rig.backends import remote
 from tests.rig.image import Image
 from tests.rig.inside import GuestControls, pack
 from tests.rig.machine import Guest
@@ -17,7 +17,7 @@ CODE = (
     "pyproject.toml",
     "tests/conftest.py",
     "tests/factories",
-    "tests/backends",
+    "tests/rig/backends",
     "tests/palpate/io/test_backends.py",
 )
 """Files of this checkout that the guest needs beside the installed box."""

@@ -27,8 +27,8 @@ from palpate.io.link import REPLY_MS
 from palpate.io.robot_link import Command, SerialSink
 from palpate.io.trigger import GpioTrigger
 from palpate.io.usb_sensor import UsbSensor
-from tests import backends
-from tests.backends import Backend, Skin, mocks, skins
+from tests.rig import backends
+from tests.rig.backends import Backend, Skin, mocks, skins
 
 SECOND = 1_000_000_000
 LIMIT_S = 10

@@ -25,8 +25,8 @@ from palpate.io.usb_sensor import UsbSensor
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from palpate.tools import pseudo_terminal
-from tests.backends import Skin, skins
 from tests.factories.serial_board import SerialBoard
+from tests.rig.backends import Skin, skins
 
 FMT = skin.FORMAT
 CLOCK = SystemClock()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from palpate.core.clock import Clock
 from palpate.core.types import EPOCH_BITS, SweepFormat
 from palpate.sim import rig, skin
-from tests.backends import Skin
 from tests.factories.simulated_box import numbered
+from tests.rig.backends import Skin
 
 _PERIOD = 97
 _LENGTH = 30 * _PERIOD  # the script is one endless act; frame i equals frame i + 97

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from palpate.core import config
 from palpate.sim import devices, rig, skin
-from tests import backends
-from tests.backends import Skin, skins, tty
 from tests.factories.paths import NO_SITE
+from tests.rig import backends
+from tests.rig.backends import Skin, skins, tty
 
 
 class Simulated:

@@ -18,7 +18,7 @@ from typing import IO, Any
 import usb.core
 
 from palpate.core import config
-from tests.backends import BackendMissing, Skin, real
+from tests.rig.backends import BackendMissing, Skin, real
 
 PORT = "/dev/virtio-ports/palpate.bench"
 CONTROLS = ["able", "reset", "plug", "unplug", "garble", "silence"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from palpate.sim import rig, usb
-from tests.backends import mocks
+from tests.rig.backends import mocks
 
 SUBMIT, DISCARD, REAP = 0x550A, 0x550B, 0x550D
 CLAIM, RELEASE, DRIVER, CAPABILITIES = 0x550F, 0x5510, 0x5508, 0x551A

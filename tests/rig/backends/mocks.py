@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.backends import BackendMissing
+from tests.rig.backends import BackendMissing
 
 DEBIAN = "/usr/lib/python3/dist-packages"
 PACKAGES = "umockdev gir1.2-umockdev-1.0 python3-gi"

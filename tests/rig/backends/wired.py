@@ -37,7 +37,7 @@ import usb.core
 from gpiod.line import Bias, Direction, Value
 
 from palpate.core import config
-from tests.backends import BackendMissing, real
+from tests.rig.backends import BackendMissing, real
 
 DRIVERS = {"GPIO17": "GPIO18", "GPIO27": "GPIO9", "GPIO22": "GPIO10"}
 WATCHERS = {
@@ -124,7 +124,7 @@ def _request(names: Any, settings: gpiod.LineSettings) -> gpiod.LineRequest:
                 ) from e
     raise BackendMissing(
         f"no gpio chip has {', '.join(names)}; "
-        "run this on a board wired as tests/backends/wired.py draws"
+        "run this on a board wired as tests/rig/backends/wired.py draws"
     )
 
 

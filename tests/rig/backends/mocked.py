@@ -5,9 +5,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 from palpate.core import config
-from tests import backends
-from tests.backends import Skin, mocked_gpio, mocked_usb, mocks, real, skins, tty
 from tests.factories.paths import NO_SITE
+from tests.rig import backends
+from tests.rig.backends import Skin, mocked_gpio, mocked_usb, mocks, real, skins, tty
 
 BOARD = "rpi5"
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from tests.backends import mocks
+from tests.rig.backends import mocks
 
 CHIP_INFO, LINE_INFO, REQUEST, GET, SET = 0xB401, 0xB405, 0xB407, 0xB40E, 0xB40F
 ACTIVE_LOW, OUTPUT, RISING, FALLING = 1 << 1, 1 << 3, 1 << 4, 1 << 5
