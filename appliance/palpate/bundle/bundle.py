@@ -193,16 +193,19 @@ def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: s
     return files[name]
 
 
-def golden_file(samples: NDArray[Any], logits: NDArray[Any], refusals: Sequence[str] = ()) -> bytes:
+def golden_file(
+    samples: NDArray[Any], logits: NDArray[Any], refusals: Sequence[Status] = ()
+) -> bytes:
     """The bytes of golden.npz for sweeps [G, T, R, C] or [G, T, R, C, A], packed by
     `arrays.changes`, and their logits [G, K]. refusals: as Bundle.golden_refusals."""
-    more = {"refusals": np.array([*refusals])} if any(refusals) else {}
+    refused = any(status is not Status.OK for status in refusals)
+    more = {"refusals": np.array([*map(str, refusals)])} if refused else {}
     return arrays.packed(changes=arrays.changes(samples), logits=logits, **more)
 
 
 def _golden(
     data: bytes, manifest: Manifest
-) -> tuple[NDArray[Any], NDArray[np.float32], tuple[str, ...]]:
+) -> tuple[NDArray[Any], NDArray[np.float32], tuple[Status, ...]]:
     """Golden sweeps [G, T, R, C] or [G, T, R, C, A], their logits [G, K] and refusals."""
     held = arrays.read(data, GOLDEN, "logits", "changes")
     samples, logits = arrays.summed(held["changes"], manifest.format, GOLDEN), held["logits"]
@@ -214,13 +217,13 @@ def _golden(
             f"{len(manifest.labels)} labels; export the bundle again"
         )
     refusals = held.get("refusals", np.array([], str))
-    known = refusals.dtype.kind == "U" and {*refusals.ravel().tolist()} <= {"", *map(str, Status)}
+    known = refusals.dtype.kind == "U" and {*refusals.ravel().tolist()} <= {*map(str, Status)}
     if not known or refusals.ndim != 1 or len(refusals) > len(samples):
         raise BundleError(
             f"{GOLDEN} holds refusals {refusals.dtype} {list(refusals.shape)}, where each of "
-            f"{len(samples)} sweeps has a status or none; export the bundle again"
+            f"{len(samples)} sweeps has a status; export the bundle again"
         )
-    return samples, logits.astype(np.float32), tuple(refusals.tolist())
+    return samples, logits.astype(np.float32), tuple(map(Status, refusals.tolist()))
 
 
 def _classes(data: bytes, manifest: Manifest) -> Classes:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.unknown import Classes
 from palpate.bundle.manifest import Manifest
-from palpate.core.types import SweepFormat
+from palpate.core.types import Status, SweepFormat
 
 _LISTS = ("means", "sweeps", "spread", "golden")
 
@@ -66,8 +66,7 @@ class Bundle:
     id: see `bundle.identity`.
     model: the bytes of model.onnx.
     golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K];
-        golden_refusals: the status of each that export refused, "" for the others; () if there are
-        none.
+        golden_refusals: the status of each, ok for one with a label; () if export refused none.
     classes: the class means, None if the manifest has no `known`.
     added: labels that a box has enrolled, None if there are none. Manifest, golden sweeps and
         classes include them.
@@ -84,7 +83,7 @@ class Bundle:
     classes: Classes | None = None
     added: AddedLabels | None = None
     base: str = ""
-    golden_refusals: tuple[str, ...] = ()
+    golden_refusals: tuple[Status, ...] = ()
     before: Bundle | None = None
 
     @property

@@ -232,9 +232,9 @@ class Verdict:
     share of the window that was used, less than 1 in an early answer. own: float64 [K]
     probabilities of this sweep alone, before an enrolled label needs its least probability
     (EnrolledLabels); empty if it has none. displacement: distance of
-    the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
+    the contact from its positions in training ("moved 2.1 mm too far towards row 4"); None if it is
     in place, or if the bundle does not have the positions. degraded: the broken taxels that were
-    bridged ("silent taxel 2.3"); "" for none. after: number of the last sweep before
+    bridged ("silent taxel 2.3"); None for none. after: number of the last sweep before
     it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
     measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
     in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
@@ -254,8 +254,8 @@ class Verdict:
     detail: str = ""
     share: float = 1.0
     own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    displacement: str = ""
-    degraded: str = ""
+    displacement: str | None = None
+    degraded: str | None = None
     after: int = 0
     speed_mm_s: float | None = None
     force_n: float | None = None
@@ -279,12 +279,12 @@ class Verdict:
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
         None. arrays: include `scores` and `own`, as lists."""
-        # sidecars, the feed and the status file call the displacement `moved`
         values = {
-            "moved" if name == "displacement" else name: value
-            for name in Verdict.__slots__
-            if (value := getattr(self, name)) is not None
+            name: value for name in Verdict.__slots__ if (value := getattr(self, name)) is not None
         }
+        # sidecars, the feed and the status file call the displacement `moved`
+        values["moved"] = values.pop("displacement", "")
+        values.setdefault("degraded", "")
         lists = {
             name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
         }

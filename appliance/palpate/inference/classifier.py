@@ -235,23 +235,23 @@ class Classifier(Observer):
         if self._means:
             self._test_means(self._means)
         for k, now in enumerate(self.refusals() if checks else ()):
-            before = next(iter(self.bundle.golden_refusals[k : k + 1]), "")
-            if now not in ("", before):
+            before = next(iter(self.bundle.golden_refusals[k : k + 1]), Status.OK)
+            if now not in (Status.OK, before):
                 raise BundleError(
-                    f"golden sweep {k} is refused as {now}, at export {before or 'it was not'}: "
-                    "numpy computes otherwise on this machine; install the locked version"
+                    f"golden sweep {k} is refused as {now}, at export it was {before}: numpy "
+                    "computes otherwise on this machine; install the locked version"
                 )
         return worst
 
-    def refusals(self) -> list[str]:
-        """The status of each golden sweep of trained labels that the stages refuse, "" for one that
+    def refusals(self) -> list[Status]:
+        """The status of each golden sweep of trained labels that the stages refuse, ok for one that
         gets a label. The stream does not count: neither its tare nor its broken taxels."""
         m, present, found = self.bundle.manifest, self._objects.present, []
         taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
         stages = [taxels, *(one for one in self._stages if one is not self.taxels)]
         for golden in self.bundle.golden[: len(self.bundle.golden) - len(self.bundle.enrolled)]:
             status = run(stages, self._context(golden, m.tare)).status
-            found.append("" if status.classified else str(status))
+            found.append(Status.OK if status.classified else status)
         self._objects.present = present
         return found
 
@@ -328,8 +328,8 @@ class Classifier(Observer):
             fused=context.fused,
             detail=self._detail(context),
             own=context.own,
-            displacement=context.displacement.text,
-            degraded=context.degraded or "",
+            displacement=context.displacement.text if context.displacement.off else None,
+            degraded=context.degraded,
             after=context.after,
             measured_mm_s=context.slide.speed_mm_s,
             direction=context.slide.direction,

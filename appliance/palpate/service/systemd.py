@@ -117,5 +117,5 @@ class VerdictLog(Observer):
         contact."""
         fine = (
             verdict.status.classified or verdict.status is Status.ABORTED
-        ) and not verdict.displacement
+        ) and verdict.displacement is None
         log.log(INFO if fine else WARNING, words(verdict))

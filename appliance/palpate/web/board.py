@@ -42,9 +42,9 @@ class PageBoard:
 
     hello: with the `names` of its labels for people, and its `finger`, "" for the only one.
     health, state: unchanged. box: whether there is a feed. verdict: with rounded `scores`, the
-    `name` of its label, the `reason` for a sweep without a label. minute: frames and lost frames of
-    the last minute. signal: a sweep's window is available. view: see alignment.view. note: another
-    bundle or program.
+    `name` of its label, the `reason` for a sweep without a label; `moved` is null in place. minute:
+    frames and lost frames of the last minute. signal: a sweep's window is available. view: see
+    alignment.view. note: another bundle or program.
     """
 
     def __init__(self, publish: Publish, finger: str = "") -> None:
@@ -136,6 +136,7 @@ class PageBoard:
         shown = {name: line[name] for name in FIELDS} | {
             "name": self._names.get(line["label"], line["label"]),
             "scores": [round(float(p), 4) for p in line["scores"]],
+            "moved": line["moved"] or None,
         }
         self._publish(
             "verdict",

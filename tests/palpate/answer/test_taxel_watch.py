@@ -97,7 +97,7 @@ def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(run, tmp_pat
     assert "2.2 2.3 2.4" in refused.detail
     tolerant = Classifier(many, VirtualClock())
     verdict = tolerant(sweep_of(CLIPPED))
-    assert (verdict.status, verdict.label, verdict.degraded) == (Status.OK, "a", "")
+    assert (verdict.status, verdict.label, verdict.degraded) == (Status.OK, "a", None)
     assert verdict.detail.startswith("38% ")
     assert tolerant(sweep_of(broken(SIX, count=3))).status is Status.DEAD_TAXEL
 
@@ -114,7 +114,7 @@ def test_more_silent_taxels_than_are_proven_are_refused(run, place, count, statu
     """The status and the places are those of a box that bridges nothing."""
     verdict = run(sweep_of(broken(place, count=count)))
     assert (verdict.status, verdict.label, verdict.detail) == (status, "", detail)
-    assert verdict.degraded == ""
+    assert verdict.degraded is None
 
 
 def test_more_noisy_taxels_than_are_proven_reach_the_network(run):
@@ -123,7 +123,7 @@ def test_more_noisy_taxels_than_are_proven_reach_the_network(run):
     taxels = GOOD.copy()
     taxels[:, [1, 2, 3], [1, 3, 0]] += noise
     verdict = run(sweep_of(taxels))
-    assert (verdict.status, verdict.degraded) == (Status.OK, "")
+    assert (verdict.status, verdict.degraded) == (Status.OK, None)
     taxels[:, 1, 2] = 0
     assert run(sweep_of(taxels)).degraded == "silent taxel 2.3"
 
@@ -136,7 +136,7 @@ def test_a_bundle_without_the_figure_bridges_nothing(tmp_path, taxels, status):
     bare = Classifier(made(tmp_path, None), VirtualClock())
     bare.frames(frames_of(taxels))
     verdict = bare(sweep_of(taxels))
-    assert (verdict.status, verdict.degraded, bare.degraded) == (status, "", "")
+    assert (verdict.status, verdict.degraded, bare.degraded) == (status, None, "")
 
 
 def test_windows_without_contact_or_with_too_many_broken_taxels_are_refused(run):
@@ -162,7 +162,9 @@ def test_early_answers_and_places_of_contact_are_of_bridged_taxels(tmp_path):
     assert early(sweep_of(broken(FOUR)[:75], share=0.75)) is None
     at = replace(toy_bundle.IN_PLACE, rows_mm=(1.5,), cols_mm=(1.5,), limit_mm=0.05)
     dead = broken(np.s_[:, 3, 3])
-    assert Classifier(made(tmp_path, contact=at), VirtualClock())(sweep_of(dead)).displacement == ""
+    assert (
+        Classifier(made(tmp_path, contact=at), VirtualClock())(sweep_of(dead)).displacement is None
+    )
     dead[::2, 3, 3] = 1  # neither constant nor loaded
     assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep_of(dead)).displacement
 

@@ -155,7 +155,7 @@ def test_it_fuses_by_the_same_rule(side):
 
 def test_without_a_tare_each_bundle_has_its_own(side):
     """The candidate has another unloaded skin, which it uses until the robot sends a TARE."""
-    other = {"id": "bbbbbbbb", "golden_refusals": ("no-contact",) * 2}
+    other = {"id": "bbbbbbbb", "golden_refusals": (Status.NO_CONTACT,) * 2}
     pair = side(lambda b: replace(b, **other, manifest=replace(b.manifest, unloaded=(1e4,) * 4)))
     pair.judge(A)
     assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1}}

@@ -114,10 +114,12 @@ def test_a_machine_that_computes_the_checks_otherwise_is_refused(default_bundle,
     with pytest.raises(BundleError, match="no-slide"):
         it.self_test()
     assert it.self_test(checks=False) < bundle.GOLDEN_TOLERANCE
-    refused = ("no-slide",) * len(default_bundle.golden)
+    refused = (Status.NO_SLIDE,) * len(default_bundle.golden)
     assert box(replace(default_bundle, golden_refusals=refused)).self_test() < 1
     with pytest.raises(BundleError, match="no-slide"):
-        box(replace(default_bundle, golden_refusals=("stuck-taxel", "no-slide"))).self_test()
+        box(
+            replace(default_bundle, golden_refusals=(Status.STUCK_TAXEL, Status.NO_SLIDE))
+        ).self_test()
 
 
 def test_verdict_carries_what_is_known(default_bundle):
@@ -261,10 +263,10 @@ def test_golden_sweeps_are_packed_without_loss(dtype, axes):
     samples[0] = np.cumsum(rng.integers(-2, 3, samples[0].shape), axis=0).astype(format.numpy_type)
     logits = rng.normal(size=(2, 4)).astype(np.float32)
     manifest = SimpleNamespace(format=format, labels=("a", "b", "c", "d"))
-    told = ("", "no-contact")
+    told = (Status.OK, Status.NO_CONTACT)
     got, answers, refusals = bundle._golden(bundle.golden_file(samples, logits, told), manifest)
     assert refusals == told
-    for wrong in (("\x1b[2J", ""), ("ok", "ok", "ok")):
+    for wrong in (("\x1b[2J", "ok"), ("ok", "", "ok"), ("ok", "ok", "unsure")):
         with pytest.raises(BundleError, match="refusals"):
             bundle._golden(bundle.golden_file(samples, logits, wrong), manifest)
     assert (got.tobytes(), got.dtype) == (samples.tobytes(), format.numpy_type)

@@ -140,7 +140,7 @@ def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path):
     it = Classifier(new, VirtualClock())
     sweep = toy_bundle.sweep(0, -1.6)
     sweep.frames.taxels[:, 1] -= 80  # less load in the second row
-    assert it(toy_bundle.sweep(0, -1.6)).displacement == ""
+    assert it(toy_bundle.sweep(0, -1.6)).displacement is None
     verdict = it(sweep)
     assert verdict.displacement
     means = ClassDistances(

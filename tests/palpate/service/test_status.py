@@ -27,7 +27,7 @@ from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 
 HEALTH = feeds.HEALTH._replace(ready=False)
 AWAY = HEALTH._replace(skin="absent", trouble="no skin on USB; check cable", streams=False)
-OK = replace(feeds.OK, displacement="")
+OK = replace(feeds.OK, displacement=None)
 SHORT = replace(
     OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0)
 )

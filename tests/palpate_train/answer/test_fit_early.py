@@ -217,6 +217,6 @@ def test_the_heads_are_scikit_learns_shrinkage_lda(materials: int, each: int):
 
 def test_a_rule_needs_limits_that_its_held_out_sweeps_can_carry():
     """With too few of them there is a reason against early answers, which says their number."""
-    assert fit_early.no_limits(fit_early.MIN_SWEEPS) == ""
+    assert fit_early.no_limits(fit_early.MIN_SWEEPS) is None
     few = fit_early.MIN_SWEEPS - 1
     assert f"{few} sweeps" in fit_early.no_limits(few)

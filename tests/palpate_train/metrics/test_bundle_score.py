@@ -139,8 +139,7 @@ def test_sweeps_outside_the_trained_positions_are_told(
         bundle_score,
         "verdicts",
         lambda *args, **more: (
-            (i, replace(verdict, displacement=words.get(i, "")))
-            for i, verdict in given(*args, **more)
+            (i, replace(verdict, displacement=words.get(i))) for i, verdict in given(*args, **more)
         ),
     )
     found = bundle_score.score(classifier, s)

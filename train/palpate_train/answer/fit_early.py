@@ -222,11 +222,11 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
     return best
 
 
-def no_limits(held_out: int) -> str:
-    """The reason against limits of known materials at each step, "" for enough held-out sweeps.
+def no_limits(held_out: int) -> str | None:
+    """The reason against limits of known materials at each step, None for enough held-out sweeps.
     Without these limits the box would answer early to anything."""
     if held_out >= MIN_SWEEPS:
-        return ""
+        return None
     return f"{held_out} sweeps were held out, and its limits need {MIN_SWEEPS}; record more"
 
 

@@ -52,7 +52,7 @@ def from_features(
         return content
     if "early" in left_out:
         calibration = replace(calibration, rule=EarlyRule(None, "left out"))
-    elif why := fit_early.no_limits(len(content.held_out)):
+    elif (why := fit_early.no_limits(len(content.held_out))) is not None:
         calibration = replace(calibration, rule=EarlyRule(None, why))
     if not (fit.contacts and fit.contacts.positions(pitch_mm)):
         calibration = replace(calibration, displacement=None)

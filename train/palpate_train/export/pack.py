@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from palpate.bundle import bundle
 from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
+from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate_train.answer.fit_window_check import MOST_REFUSED, highest_count
 from palpate_train.answer.rules import ALL, Asked, present
@@ -89,7 +90,7 @@ def pack(
         if set(present(packed)) - set(present(chosen)):
             figures = judge(chosen, held_out, logits, protocol)
         files |= {bundle.MEANS: means_file(chosen.classes)} if chosen.classes else {}
-        if any(refused := Classifier(chosen, SystemClock()).refusals()):
+        if set(refused := Classifier(chosen, SystemClock()).refusals()) - {Status.OK}:
             golden = chosen.golden, chosen.golden_logits
             files[bundle.GOLDEN] = bundle.golden_file(*golden, refused)
         manifest = replace(

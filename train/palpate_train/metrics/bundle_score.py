@@ -218,7 +218,7 @@ def score(classifier: Classifier, sweeps: Dataset) -> BundleScore:
         statuses[str(verdict.status)] += 1
         given[i] = verdict.label if verdict.status is Status.OK else f"({verdict.status})"
         unsure_right += verdict.status is Status.UNSURE and verdict.label == material[i]
-        displaced.update([verdict.displacement] if verdict.displacement else [])
+        displaced.update([] if verdict.displacement is None else [verdict.displacement])
     by_material = {name: Counter(given[material == name].tolist()) for name in present}
     clusters, by = _clusters(sweeps)
     return BundleScore(

@@ -100,7 +100,7 @@ def _point(
         named = verdict.status is Status.OK
         right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
         unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN
-        moved[i] = bool(verdict.displacement)
+        moved[i] = verdict.displacement is not None
         network[i] = box.bundle.manifest.labels[int(box.logits(window).argmax())] == truth
         found = centre(window, box.tare, limits.contact)
         distance_mm[i] = np.hypot(*place.offset(found)) if found else np.nan

@@ -63,7 +63,7 @@ function row(one) {
   if (!one.label) what.title = one.reason;
   made("span", "number", one.label ? percentAtMost(one.probability) : "", made_row);
   made("span", "ms number", one.label ? `${(one.latency_ns / 1e6).toFixed(1)} ms` : "", made_row);
-  if (one.moved) made("span", "more", one.moved, made_row);
+  if (one.moved !== null) made("span", "more", one.moved, made_row);
   return made_row;
 }
 

@@ -43,10 +43,9 @@ function of(sweep, now) { return `sweep ${sweep.sweep}, ${clock(sweep.at)}, ${ag
 function before(last, now) { return last ? `Before that: ${last.name || last.status}, ${of(last, now)}.` : ""; }
 
 /* What the card shows. verdict: the last one with its time `at`, in ms; fresh: whether it is of the program that runs now. swept: whether
-   it is of a sweep before the one that is open now. away:
-   "" or why nothing is heard, with lastAt (0: unknown). */
+   it is of a sweep before the one that is open now. away: why nothing is heard, with lastAt (0: unknown); null where the box is heard. */
 export function card({verdict, fresh, swept, health, windowS, away, detail, lastAt, now}) {
-  if (away) {
+  if (away !== null) {
     const since = lastAt ? `Last heard at ${clock(lastAt)}, ${ago(now - lastAt)} ago.` : "";
     return {tone: "away", status: "off", words: away, advice: since, small: before(verdict, now), detail};
   }
@@ -64,13 +63,13 @@ export function card({verdict, fresh, swept, health, windowS, away, detail, last
 }
 
 function answer(verdict, windowS, next, now) {
-  const status = verdict.moved && (verdict.status === "ok" || verdict.status === "unknown") ? "displaced" : verdict.status;
+  const moved = verdict.moved !== null, status = moved && (verdict.status === "ok" || verdict.status === "unknown") ? "displaced" : verdict.status;
   let [tone, words, advice] = WORDS[status] ?? ["bad", verdict.status, verdict.reason];
   if (verdict.status === "short" && windowS) advice = `Slide for longer than ${windowS} s.`;
   const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.name}, ${percentAtMost(verdict.probability)}` : "";
   const more = [named ? percent(verdict.probability) : candidate && `Perhaps ${candidate}`,
     verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : ""];
-  return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
+  return {tone, status: named && !moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
     small: more.filter(Boolean).join(", "), moved: verdict.moved,
     detail: [verdict.detail === verdict.moved ? "" : verdict.detail, verdict.reason].filter(Boolean).join("; "), named};
 }
@@ -92,8 +91,9 @@ export function drawCard(shown) {
   put("next", shown.next ?? "");
   byId("why").hidden = !shown.detail;
   put("detail", shown.detail);
-  if (byId("moved").dataset.shown === (shown.moved ?? "")) return;
-  byId("moved").dataset.shown = shown.moved ?? "";
-  fill(byId("moved"), ...(shown.moved ? [`${shown.moved}: `] : []));
-  if (shown.moved) Object.assign(made("a", "", "align the skin", byId("moved")), {href: "#align"});
+  const moved = shown.moved ?? null; // a card without an answer has none
+  if (byId("moved").dataset.shown === String(moved)) return;
+  byId("moved").dataset.shown = moved;
+  fill(byId("moved"), ...(moved === null ? [] : [`${moved}: `]));
+  if (moved !== null) Object.assign(made("a", "", "align the skin", byId("moved")), {href: "#align"});
 }

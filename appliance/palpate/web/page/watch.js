@@ -57,18 +57,18 @@ function live() { return reached === true && (known.box ? known.box.there && kno
 
 function age() { return known.heardAt ? `, last heard ${ago(Date.now() - known.heardAt)} ago` : ""; }
 
-/* Why nothing is heard of the box, in words for an operator; "" where it is heard. */
+/* Why nothing is heard of the box, in words for an operator; null where it is heard. */
 function away() {
   if (reached === false) return answers ? "The box does not answer" : "No connection to the box";
-  return known.box && !known.box.there ? "The box is off or restarting" : "";
+  return known.box && !known.box.there ? "The box is off or restarting" : null;
 }
 
-/* Why what is shown is not of this moment; "" where it is. */
+/* Why what is shown is not of this moment; null where it is. */
 function trouble() {
   const gone = away(), {health} = known;
-  if (gone) return `${gone}${age()}`;
+  if (gone !== null) return `${gone}${age()}`;
   if (reached && known.box && health && health.skin !== "streaming" && !sees("align")) return skin(health.skin).join(": ");
-  return "";
+  return null;
 }
 
 /* Which view is shown; `palpate skin align` has that of alignment only. */
@@ -108,12 +108,12 @@ function drawHeader() {
   const said = reached !== true ? "no connection" : known.box && !known.box.there ? "box off" : !skin ? "waiting" :
     skin !== "streaming" || !known.box ? `skin ${skin}` : health.sweeping ? "sweeping" : health.ready ? "ready" : "not ready";
   const why = trouble();
-  frame({state: said, fine: live(), source, why: sees("align") ? "" : why}); // there the words say it
-  document.body.classList.toggle("stale", Boolean(why));
-  document.body.classList.toggle("away", Boolean(away()));
+  frame({state: said, fine: live(), source, why: sees("align") ? "" : why ?? ""}); // there the words say it
+  document.body.classList.toggle("stale", why !== null);
+  document.body.classList.toggle("away", away() !== null);
 }
 
-let toned = "";
+let toned = null;
 
 function drawVerdict() {
   const {health, hello, box} = known, verdict = last(known.verdicts);
@@ -122,7 +122,7 @@ function drawVerdict() {
     detail: reached ? box?.why ?? "" : "The page tries again by itself."});
   drawCard(shown);
   const event = `${shown.tone} ${shown.tone === "away" ? "" : verdict && key(verdict)}`;
-  if (toned && toned !== event) play(shown.tone);
+  if (toned !== null && toned !== event) play(shown.tone);
   toned = event;
 }
 
@@ -146,10 +146,10 @@ function drawSkin() {
 
 function drawWords() {
   const {view} = known, news = trouble();
-  if (news || !view) {
+  if (news !== null || !view) {
     document.body.dataset.state = "no-connection";
-    if (news) put("message", known.box && reached ? "the box is off or restarting" : "no connection");
-    if (news) put("hint", known.box || answers ? news : "see that palpate skin align still runs on the box, and the tunnel to it");
+    if (news !== null) put("message", known.box && reached ? "the box is off or restarting" : "no connection");
+    if (news !== null) put("hint", known.box || answers ? news : "see that palpate skin align still runs on the box, and the tunnel to it");
     byId("push").toggleAttribute("hidden", true);
     return;
   }
