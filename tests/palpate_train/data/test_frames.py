@@ -181,11 +181,20 @@ def test_a_column_of_dates_gives_the_times():
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
-@pytest.mark.parametrize("form", ["{} sec", "{}s", "{} seconds", "{} \u00b5s", "{}nsec"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        *("{} sec", "{}s", "{} seconds", "{} \u00b5s", "{}nsec", "{} min", "{} hrs", "{} days"),
+        *("{} microseconds", "{} nanoseconds"),
+    ],
+)
 def test_times_may_have_their_unit_behind_each(form: str):
     """As MATLAB writes durations; another unit than that of --time is refused."""
-    table = text(("t", "a"), texts={0: [form.format(k / 100) for k in range(40)]})
-    unit = {"\u00b5": "us", "n": "ns"}.get(form.strip("{} ")[0], "s")
+    times = [form.format(k / 100).replace(".", ",."[k % 2]) for k in range(40)]
+    table = text(("t", "a"), texts={0: times})
+    words = {"\u00b5": "us", "n": "ns", "mic": "us", "min": "min", "h": "h", "d": "d"}
+    word = form.strip("{} ")
+    unit = next((unit for start, unit in words.items() if word.startswith(start)), "s")
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time=f"t:{unit}", rate_hz=None))
     np.testing.assert_allclose(time_s / frames.sampling.UNITS_S[unit], np.arange(40) / 100)
     with pytest.raises(FormatError, match=f"--time t:{unit}"):
@@ -220,6 +229,10 @@ def test_times_may_have_their_unit_behind_each(form: str):
         "20260131_1259{1:02d}_{2:03d}",
         "59:{0:06.3f}",
         "2 days 00:59:{0:09.6f}",
+        "2026\u5e741\u670831\u65e5 12:59:{0:06.3f}",
+        "'2026-01-31 12:59:{0:06.3f}",
+        "2026-01-31-12-59-{1:02d}-{2:03d}",
+        "Jan 31 12:59:{0:06.3f}",
     ],
 )
 def test_dates_of_other_forms_give_the_times(form: str):
@@ -266,7 +279,12 @@ def test_a_row_for_each_taxel_may_begin_with_its_name():
 
 
 @pytest.mark.parametrize(
-    "form", ["2026-01-{0} {1}", "{0}.1.2026 {1}", "{0}-Jan-2026 {1}", "Jan {0}, 2026 {1}", "{1}"]
+    "form",
+    [
+        *("2026-01-{0} {1}", "{0}.1.2026 {1}", "{0}-Jan-2026 {1}", "Jan {0}, 2026 {1}", "{1}"),
+        *("1/{0}/2026 {1}", "{0}/1/2026 {1}", "{0} Sept. 2026 {1}", "{0}. M\u00e4rz 2026 {1}"),
+        *("Jan {0} {1}", "2026\u5e741\u6708{0}\u65e5 {1}"),
+    ],
 )
 def test_dates_go_on_at_midnight(form: str):
     """Days that change, and a clock that begins again."""
@@ -291,6 +309,8 @@ def test_fields_cut_a_table_where_they_change():
     found = frames.fields(table, {"material": "l", "session": "d", "trial": "n"}, 40)
     assert [(part.start, part.stop) for part, _ in found] == [(0, 10), (10, 30), (30, 35), (35, 40)]
     assert found[1][1] == {"material": "felt", "session": "2026-01-30", "trial": "7"}
+    unnamed = replace(table, columns=())
+    assert frames.fields(unnamed, {"material": "1"}, 40)[1][1] == {"material": "felt"}
     labels[4] = ""
     with pytest.raises(FormatError, match="frame 5"):
         frames.fields(table, {"material": "l"}, 40)
@@ -368,6 +388,7 @@ def test_facts_about_a_recording_are_fields(tmp_path: Path):
             file[f"data/demo_{k}/obs/skin"] = x + k
         file["data/demo_1"].attrs["material"] = b"felt"
         file["data/demo_0/operator"] = "Ada"
+        file["meta/finger"] = "left"
         file["data/demo_0/secret"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/secret")
     asked = {"material": "material", "session": "session"}
     for k, name in enumerate(("cork", "felt")):
@@ -379,6 +400,18 @@ def test_facts_about_a_recording_are_fields(tmp_path: Path):
         assert "secret" not in table.facts
         with pytest.raises(FormatError, match="'task'"):
             frames.fields(table, {"material": "task"}, 40)
+    table = raw_files.read(tmp_path / "a.hdf5", ReadPlan(path, fields=("meta/finger",)))
+    assert table.facts["meta/finger"] == "left"
+    for suffix in (".h5", ".nc"):  # netCDF of version 4 is HDF5
+        with h5py.File(tmp_path / f"b{suffix}", "w") as file:
+            file["run/skin"] = x
+            file["run/skin"].attrs["material"] = "wood"
+            file["run/when"] = [f"2026-01-31 12:00:{k}" for k in range(40)]
+        asked = ReadPlan(time="when", fields=("material",))
+        table = raw_files.read(tmp_path / f"b{suffix}", asked)
+        assert table.facts["material"] == "wood"
+        _, time_s, _ = frames.frames(table, plan(grid="2x2", time="when:date", rate_hz=None))
+        np.testing.assert_array_equal(time_s, np.arange(40))
     lines = {"material": "wood", "rate": 100, "frames": x.reshape(40, 4).tolist()}
     (tmp_path / "a.json").write_text(json.dumps(lines))
     table = raw_files.read(tmp_path / "a.json")

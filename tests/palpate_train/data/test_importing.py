@@ -332,6 +332,9 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
         text(tmp_path / f"{name}_1.csv", COUNTS + k)
     s = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).sweeps
     assert (s.materials, s.labels.tolist()) == (("ab", "felt"), [0, 1, 0])
+    text(tmp_path / "Felt_1.csv", COUNTS + 3)
+    notes = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).notes
+    assert ["'Felt' and 'felt'" in note for note in notes].count(True) == 1
     with pytest.raises(FormatError, match="'felz'"):
         taken(tmp_path, renames={"felz": "wool"})
 

@@ -38,7 +38,7 @@ OPTIONS = {
         "TYPE",
         f"type of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)",
     ),
-    "--time": ("COLUMN:UNIT", "column of the sampling times, in s, ms, us or ns: t:ms, 1:s"),
+    "--time": ("COLUMN:UNIT", "the sampling times, in s, ms, us, ns, min, h or d: t:ms, 1:s"),
     "--every": (
         "LENGTH",
         "cut windows from the start on, one each LENGTH (the middle window alone)",

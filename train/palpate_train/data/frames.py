@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from palpate.core.errors import FormatError
 from palpate.core.text import printable
 from palpate.core.types import LARGEST_READING
 from palpate_train.data import sampling
-from palpate_train.data.files.table import Table, normal
+from palpate_train.data.files.table import MOST_LISTED, Table, excerpt, normal
 from palpate_train.data.import_plan import DATE, ImportPlan
 
 Array = NDArray[Any]
@@ -27,7 +28,7 @@ DAY_S = 86_400
 _NAMED = r"\d{1,2}\.?[- ][^\W\d_]{3,9}\.?[- ]\d{2,4}|[A-Za-z]{3,9} \d{1,2}(?:,? \d{4})?"
 MOMENT = re.compile(
     r"(?:(?:[A-Z][a-z]{1,8},? )?"
-    rf"(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ,_-]+)?"
+    rf"(?P<day>\d{{1,4}}[-./年]\d{{1,2}}[-./月]\d{{1,4}}日?|{_NAMED})[T ,_-]+)?"
     r"(?:(?P<since>\d+)(?: days?,? |\.(?=\d\d:)))?(?P<hour>\d{1,2}):(?P<minute>\d{1,2})"
     r"(?::(?P<second>\d{1,2}(?:[.,]\d+|:\d{3}(?:\d{3})?)?))?\s?(?P<noon>[aApP]\.?[mM]\.?)?"
     r"\s?(?P<zone>Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s?(?P<place>[A-Z]{3,5}|\[[\w/]+\])?"
@@ -35,20 +36,16 @@ MOMENT = re.compile(
 )
 """A time of the day, perhaps with its date and zone; the year may stand at the end. Or a time since
 the beginning, with its days."""
-COMPACT = re.compile(r"(\d{4})(\d\d)(\d\d)[T_ -](\d\d)(\d\d)(\d\d)(?:[._,](\d+))?(Z?)")
-"""The same in digits alone."""
+COMPACT = re.compile(r"(\d{4})-?(\d\d)-?(\d\d)[T_ -](\d\d)-?(\d\d)-?(\d\d)(?:[._,-](\d+))?(Z?)")
+"""The same in digits, perhaps with -, as in names of files."""
 MINUTES = re.compile(r"(\d{1,2}):(\d\d[.,]\d+)")
 """Minutes and seconds alone, as spreadsheets write times below an hour."""
-MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
-NAMED_DAY = re.compile(
-    r"(?:(?P<first>\d{1,2})[- ])?(?P<month>[A-Za-z]+)(?:[- ](?P<second>\d{1,2}),?)?"
-    r"[- ](?P<year>\d{4}|\d\d)"
-)
-"""A date whose month is an English word."""
-WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\W\d_]+)")
+WITH_UNIT = re.compile(r"([-+]?\d+(?:[.,]\d*)?(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\W\d_]+)")
 WORDS = {
-    "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "ms": "ms", "msec": "ms",
-    "us": "us", "usec": "us", "\u00b5s": "us", "\u03bcs": "us", "ns": "ns", "nsec": "ns",
+    "s": "s", "sec": "s", "second": "s", "ms": "ms", "msec": "ms", "millisecond": "ms",
+    "us": "us", "usec": "us", "\u00b5s": "us", "\u03bcs": "us", "microsecond": "us",
+    "ns": "ns", "nsec": "ns", "nanosecond": "ns", "min": "min", "minute": "min",
+    "h": "h", "hr": "h", "hour": "h", "d": "d", "day": "d",
 }  # fmt: skip
 """Units of times behind each number, as tables of durations have them."""
 
@@ -186,6 +183,8 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
         if len(time_s) != len(values):
             raise FormatError(f"{name} holds {len(time_s)} times, there are {len(values)} frames")
         return None, time_s
+    if name in table.labels and unit == DATE:
+        return None, _dates(name, table.labels[name])
     if values.ndim != 2 or (not table.columns and table.beside and not RANGE.fullmatch(name)):
         raise FormatError(
             f"has no times {name!r}; beside the frames it has "
@@ -193,34 +192,40 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
         )
     (at,) = column_numbers(name, table.columns, values.shape[1], "--time", 1)
     if unit == DATE:
-        return at, _dates(name, table, at)
+        return at, _dates(name, table.texts.get(at, ()))
     if at in table.texts:
         found = [WITH_UNIT.fullmatch(text.strip()) for text in table.texts[at]]
-        units = {WORDS.get(one["unit"].lower(), "") if one else "" for one in found}
+        units = {_unit(one["unit"].lower()) if one else "" for one in found}
         if units == {unit}:
-            return at, np.array([float(one[1]) for one in found if one]) * sampling.UNITS_S[unit]
+            numbers = [float(one[1].replace(",", ".")) for one in found if one]
+            return at, np.array(numbers) * sampling.UNITS_S[unit]
         if len(units) == 1 and (other := units.pop()):
             raise FormatError(f"column {name} holds times in {other}; write --time {name}:{other}")
         raise FormatError(
-            f"column {name} holds text, such as {table.texts[at][0]!r}; "
+            f"column {name} holds text, such as {excerpt(table.texts[at][0])}; "
             f"for dates with a clock time write --time {name}:{DATE}"
         )
     _check_numbers(table, [at])
     return at, values[:, at] * sampling.UNITS_S[unit]
 
 
-def _dates(name: str, table: Table, at: int) -> Array:
+def _unit(word: str) -> str:
+    """The unit that a word means, "" for none: sec or seconds, hrs."""
+    return WORDS.get(word) or WORDS.get(word.removesuffix("s"), "")
+
+
+def _dates(name: str, given: Sequence[str]) -> Array:
     """The times [n] in seconds of a column of dates or of times of the day, from its first on.
     Raises FormatError."""
-    if at not in table.texts:
+    if not given:
         raise FormatError(f"column {name} holds numbers, not dates; name their unit")
-    texts = [COMPACT.sub(_apart, text.strip()) for text in table.texts[at]]
+    texts = [COMPACT.sub(_apart, text.strip(" '")) for text in given]
     texts = [f"0:{text}" if MINUTES.fullmatch(text) else text for text in texts]
     found = [MOMENT.fullmatch(text) for text in texts]
     if None in found:
         k = found.index(None)
         raise FormatError(
-            f"frame {k + 1}: {table.texts[at][k]!r} in column {name} is not a date such as "
+            f"frame {k + 1}: {given[k]!r} in column {name} is not a date such as "
             "2026-01-31 12:00:00.5"
         )
     parts = [one.groupdict("") for one in found if one]
@@ -228,10 +233,8 @@ def _dates(name: str, table: Table, at: int) -> Array:
         raise FormatError(
             f"column {name} has times in {' and '.join(places)}; write the zone as +01:00"
         )
-    days = _days(name, [one["day"] + one["year"] for one in parts])
     clock = np.array([_clock_s(one) + DAY_S * int(one["since"] or 0) for one in parts])
-    if not any(one["day"] for one in parts):  # times of the day begin again at midnight
-        days = np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY_S / 2)
+    days = _days(name, [one["day"] + one["year"] for one in parts], clock)
     times: Array = (days - days[0]) * DAY_S + clock - clock[0]
     return times
 
@@ -242,30 +245,26 @@ def _apart(found: re.Match[str]) -> str:
     return f"{year}-{month}-{day} {hour}:{minute}:{second}.{fraction or 0}{zone}"
 
 
-def _days(name: str, texts: Sequence[str]) -> Array:
-    """The days [n] as numbers. Any form will do if the day does not change. Raises FormatError."""
-    if len(set(texts)) == 1:
+def _days(name: str, texts: Sequence[str], clock: Array) -> Array:
+    """The days [n] as numbers. A day in any form is the next one if the clock begins again with it.
+    Raises FormatError."""
+    if len({*texts}) == 1 and texts[0]:
         return np.zeros(len(texts))
-    texts = [_numbered(text) for text in texts]
     iso = [re.sub(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})$", r"\3-\2-\1", text) for text in texts]
     iso = [re.sub(r"-(\d)(?!\d)", r"-0\1", text.replace("/", "-")) for text in iso]
+    midnights = np.diff(clock, prepend=clock[0]) < -DAY_S / 2
     try:
-        return np.array(iso, "datetime64[D]").astype(np.int64)
+        days: Array = np.array(iso, "datetime64[D]").astype(np.int64)
     except ValueError as e:
-        day = next(text for text in texts if text != texts[0])
-        raise FormatError(
-            f"the day changes from {texts[0]!r} to {day!r} in column {name}; "
-            "write days as 2026-01-31"
-        ) from e
-
-
-def _numbered(day: str) -> str:
-    """A day whose month is a word, such as 01-May-2024 or May 1, 2024, as 2024-05-01."""
-    found = NAMED_DAY.fullmatch(day)
-    if not found or found["month"][:3].lower() not in MONTHS:
-        return day
-    month = MONTHS.index(found["month"][:3].lower()) + 1
-    return f"{found['year']:0>4}-{month:02d}-{int(found['first'] or found['second']):02d}"
+        changes = [False, *(a != b for a, b in pairwise(texts))]
+        if changes != midnights.tolist():
+            day = next(text for text in texts if text != texts[0])
+            raise FormatError(
+                f"the day changes from {texts[0]!r} to {day!r} in column {name}, and not at "
+                "midnight; write days as 2026-01-31"
+            ) from e
+        return np.cumsum(midnights)
+    return days if any(texts) else np.cumsum(midnights)
 
 
 def _clock_s(parts: Mapping[str, str]) -> float:
@@ -313,7 +312,7 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
         why = _mismatch(len(numbers), len(values), plan, time_column)
         if table.texts and not plan.columns:
             at, texts = next(iter(table.texts.items()))
-            why += f"; column {at + 1} is text, such as {texts[0]!r}"
+            why += f"; column {at + 1} is text, such as {excerpt(texts[0])}"
         why += "".join(f"; {note}" for note in table.notes if "left out: it" in note)
         raise FormatError(why)
     return values[:, numbers].reshape(len(values), *shape)
@@ -361,7 +360,7 @@ def _check_numbers(table: Table, numbers: Sequence[int]) -> None:
         if i in table.texts:
             name = f" {table.columns[i]!r}" if table.columns else ""
             raise FormatError(
-                f"column {i + 1}{name} holds text, such as {table.texts[i][0]!r}; "
+                f"column {i + 1}{name} holds text, such as {excerpt(table.texts[i][0])}; "
                 "name the columns of the taxels with --columns"
             )
     if found := [table.faults[i] for i in sorted(table.faults) if i in numbers]:
@@ -395,7 +394,10 @@ def column_numbers(
             found += matching
         else:
             known = f"its {wide} columns have no names: use numbers"
-            known = f"its columns are {', '.join(names)}" if names else known
+            if names:
+                more = len(names) - 2 * MOST_LISTED
+                known = f"its columns are {', '.join(names[: 2 * MOST_LISTED])}"
+                known += f" and {more} more" * (more > 0)
             raise FormatError(f"{option}: there is no column {part!r}; {known}")
     if len(set(found)) < len(found) or len(found) > most:
         raise FormatError(
@@ -444,10 +446,10 @@ def fields(
             known = normal(column)
             columns[name] = list(table.labels.get(known, ())) or [table.facts[known]] * count
             continue
-        if not table.columns and table.facts:
-            listed = ", ".join(map(printable, table.facts))
+        if table.values.ndim > 2 or (not table.columns and not RANGE.fullmatch(column)):
+            listed = ", ".join(map(printable, table.facts)) or "none"
             raise FormatError(f"--field: there is no fact {column!r}; it has {listed}")
-        (at,) = column_numbers(column, table.columns, len(table.columns), "--field", 1)
+        (at,) = column_numbers(column, table.columns, table.values.shape[1], "--field", 1)
         _check_numbers(table, [] if at in table.texts else [at])
         texts = (
             [DAY.sub(r"\1", text.strip()) for text in table.texts[at]]

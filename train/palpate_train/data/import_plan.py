@@ -106,7 +106,8 @@ class ImportPlan:
         if self.time and self.time.rpartition(":")[2] not in (*sampling.UNITS_S, DATE):
             raise FormatError(
                 f"--time {self.time} names no unit; "
-                f"write {self.time}:s, :ms, :us or :ns, or :{DATE} for dates with a clock time"
+                f"write {self.time}:s, :ms, :us, :ns, :min, :h or :d, or :{DATE} for dates with a "
+                "clock time"
             )
         if self.dtype and self.dtype not in DATA_TYPES:
             raise FormatError(

@@ -387,6 +387,7 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
     if not starts:
         between = f" in a row ({runs.gaps} gaps)" if runs.gaps else ""
         why = f"has {len(longest)} frames{between}, but a window needs {window}; see --window"
+        why += f" and the unit of --time: {rate_hz:g} Hz" * bool(plan.time)
         return Cut(one, np.empty(0), why)
     windows = _windows(starts, window)
     if runs.interpolated and not (one.frames % 1).any():
@@ -470,7 +471,13 @@ def _set(
         units=units,
         displays={name: texts[0] for name, texts in displays.items() if len(texts) == 1},
     )
+    alike = [(a, b) for a in materials for b in materials if a < b and a.lower() == b.lower()]
     return sweeps, [
+        *(
+            f"warning: materials {a!r} and {b!r} differ in capitals alone; --rename '{a}={b}' "
+            "joins them"
+            for a, b in alike
+        ),
         *(
             f"{text!r} is sent as {name!r}; --rename changes that"
             for name, texts in displays.items()

@@ -77,7 +77,7 @@ REMEDIES = {
     (".edf", ".bdf", ".gdf"): "a biosignal recording; export it as CSV",
     (".slx", ".m", ".mlx", ".mlapp"): "a program of MATLAB; save its data with -v7",
     (".lvbit", ".vi"): "a program of LabVIEW; save its data as .lvm or .tdms",
-    (".nc", ".cdf"): "not read here; export the array as HDF5 or .npy",
+    (".nc", ".cdf"): "netCDF of version 3; export the array as HDF5 or .npy",
 }
 """What to do with formats that we do not read, by suffix."""
 MAGIC = {
@@ -144,10 +144,10 @@ def _read(path: Path, wanted: ReadPlan) -> Table:
             raise FormatError(f"cannot be read: {why}; {AGAIN}") from e
     if reader:
         return reader(path, wanted)
-    if remedy := next((why for suffixes, why in REMEDIES.items() if suffix in suffixes), ""):
-        raise FormatError(f"is {remedy}")
     if h5py.is_hdf5(path):
         return hdf5.read(path, wanted)
+    if remedy := next((why for suffixes, why in REMEDIES.items() if suffix in suffixes), ""):
+        raise FormatError(f"is {remedy}")
     data = path.read_bytes()
     if remedy := next((why for magic, why in MAGIC.items() if data.startswith(magic)), ""):
         raise FormatError(f"is {remedy}")

@@ -138,12 +138,13 @@ def test_json_is_read(tmp_path: Path, content: bytes):
 def test_acquired_data_is_read(tmp_path: Path):
     """Edge Impulse's format: sensors by name, times by its interval; a short frame is named."""
     sensors = [{"name": name, "units": "N"} for name in "abcd"]
-    payload = {"interval_ms": 10, "sensors": sensors, "values": SKIN.tolist()}
+    payload = {"interval_ms": 10, "sensors": sensors, "values": SKIN.tolist(), "device_name": "a"}
     (tmp_path / "a.json").write_text(json.dumps({"signature": "0", "payload": payload}))
     found = raw_files.read(tmp_path / "a.json")
     np.testing.assert_array_equal(found.values, SKIN)
     assert found.columns == tuple("abcd")
     assert "100 Hz" in found.notes[0]
+    assert found.facts["device_name"] == "a"
     np.testing.assert_allclose(found.vectors["time"], np.arange(len(SKIN)) / 100)
     payload["values"][4] = [1, 2]
     (tmp_path / "a.json").write_text(json.dumps({"payload": payload}))
@@ -174,6 +175,7 @@ FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
             ).encode(),
             "",
         ),
+        (json.dumps({str(i): x for i, x in enumerate(FRAMES)}).encode(), ""),
     ],
 )
 def test_frames_inside_of_json_are_read(tmp_path: Path, content: bytes, note: str):

@@ -68,6 +68,7 @@ def test_no_interval(tmp_path: Path, make: Callable[..., None], key: str, value:
         *(("values", v, "values is") for v in (0, None, 1.5, "abc", {})),
         ("values", [*SKIN.tolist(), [1, 2]], "entry 41"),
         ("sensors", [], "payload.sensors"),
+        ("sensors", [{"name": "skin"}] * 4, "'skin' twice"),
     ],
 )
 def test_acquired_data_without_a_key(tmp_path: Path, key: str, value: Any, said: str):

@@ -63,6 +63,11 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     np.testing.assert_array_equal(found.values[:, 2:], SKIN)
     np.testing.assert_allclose(found.values[:, 0], TIMES)
     assert found.texts[1][0] == "wood"
+    facts = [["material", "wood"], ["rate", 100], ["taxels", 4]]
+    means = [["", "", *"abcd"], ["Mean", "wood", 1, 2, 3, 4]]
+    found = raw_files.read(book(tmp_path / "c.xlsx", {"f": facts, "run": ROWS, "m": means}))
+    np.testing.assert_array_equal(found.values[:, 2:], SKIN)
+    assert found.notes == ("sheet f is left out", "sheet m is left out")
     path = book(tmp_path / "b.xlsx", {"one": ROWS, "two": ROWS})
     with pytest.raises(FormatError, match="2 sheets"):
         raw_files.read(path)

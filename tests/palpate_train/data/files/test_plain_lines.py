@@ -42,6 +42,7 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
         (joined(",", "{} mV"), "units"),
         (joined(";", "{}N"), "units"),
         (joined(";", "{} kΩ"), "units"),
+        *((joined(",", "{} " + unit), "units") for unit in ("gf", "pF", "F", "LSB", "mbar", "µT")),
         (joined(",", "{:x}".replace("{", "0x{")), "hexadecimal"),
         (joined(",", "{}.0D+00"), "exponents"),
         (labelled(",", ":"), ""),
@@ -70,11 +71,13 @@ def test_separators_that_are_no_decimal_sign(tmp_path: Path, sign: str):
 
 
 def test_signs_of_typographers_are_read(tmp_path: Path):
-    """Blanks of other widths separate columns, without another sign; U+2212 is a minus."""
+    """Blanks of other widths separate columns, without another sign; U+2212 and U+2013 are a minus;
+    colours of a terminal are left out."""
     found = read(tmp_path, joined("\u00a0", "{}"))
     np.testing.assert_array_equal(found.values, SKIN)
-    found = read(tmp_path, joined(";", "\u2212{}"))
-    np.testing.assert_array_equal(found.values, -SKIN)
+    for form in ("\u2212{}", "\u2013{}", "\x1b[0;32m-{}\x1b[0m"):
+        found = read(tmp_path, joined(";", form))
+        np.testing.assert_array_equal(found.values, -SKIN)
 
 
 @pytest.mark.parametrize("sign", [",", " "])
@@ -85,6 +88,7 @@ def test_signs_of_typographers_are_read(tmp_path: Path):
         ("", ": ", "12:00:01.100"),
         ("2026-01-31 ", " ", "2026-01-31T12:00:01.100"),
         ("[2026-01-31 ", "] ", "2026-01-31T12:00:01.100"),
+        ("[2026-01-31 ", "],", "2026-01-31T12:00:01.100"),
     ],
 )
 def test_the_serial_monitors_clock_is_a_column(
@@ -101,7 +105,7 @@ def test_the_serial_monitors_clock_is_a_column(
     found = raw_files.read(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)
     assert found.texts[0][11] == clock
-    if sign == " " or mark in (" ", ": "):
+    if sign == " " or mark in (" ", ": ", "],"):
         return
     (tmp_path / "a.txt").write_text(text.replace(mark, f"{mark}force:").replace(",", ",b:"))
     found = raw_files.read(tmp_path / "a.txt")

@@ -14,10 +14,10 @@ BODY = "".join(",".join(map(str, row)) + "\n" for row in ROWS)
 HEAD = "a,b,c,d\n"
 
 
-def read(text: str | bytes, decimal: str = "") -> Table:
+def read(text: str | bytes, decimal: str = "", time: str = "") -> Table:
     """The table in a text."""
     content, notes = decoded(text if isinstance(text, bytes) else text.encode())
-    return table(lines_of(content), ReadPlan(decimal=decimal), notes)
+    return table(lines_of(content), ReadPlan(decimal=decimal, time=time), notes)
 
 
 def check_whole(text: str | bytes, names: tuple[str, ...] = ("a", "b", "c", "d")) -> Table:
@@ -190,6 +190,10 @@ def test_columns_may_be_named_by_numbers(first: int):
     """A head of mats and insoles: a word, then 0 to N - 1 or 1 to N; never the first frame."""
     names = [str(first + k) for k in range(3)]
     check_whole(f"time,{','.join(names)}\n{BODY}", ("time", *names))
+    head = ",".join(map(str, range(first, first + 4)))
+    frames = "9,9,7,9\n5,8,9,9\n8,9,9,8\n"
+    assert len(read(f"{head}\n{frames}").values) == 3
+    assert len(read(f"{head}\n0,9,9,9\n{frames}").values) == 5  # within reach
     labels = "".join(f"cork,{line}\n" for line in ["1,2,3,4", *BODY.splitlines()])
     assert len(read(labels).values) == len(ROWS) + 1  # all rows begin with a word
 
@@ -198,7 +202,10 @@ def test_columns_may_be_named_by_numbers(first: int):
 def test_rows_of_statistics_are_no_frames(word: str):
     """A word where all frames have a number, above or below: left out, and said."""
     row = f"{word},25.5,25.5,25.5\n"
-    for text in (HEAD + BODY + row + row, row + row + BODY, HEAD + row + BODY):
+    sums = row.replace("25.5", "{}").format(1.5, 2.5, 7)
+    for text in (HEAD + BODY + row + row, HEAD + row + BODY, HEAD + sums + sums + BODY):
+        check_whole(text)
+    for text in (row + row + BODY, HEAD + BODY + row, HEAD + sums + BODY):
         found = read(text)
         np.testing.assert_array_equal(found.values, ROWS)
         assert any(word.strip('"') in said for said in found.notes)
@@ -213,6 +220,8 @@ def test_names_stand_on_the_last_line_before_the_numbers():
     check_whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
     check_whole(HEAD + "N,N,N,V\n" + BODY)
     check_whole("# " + HEAD + BODY)
+    found = read(HEAD + "CH=0,CH=1,CH=2,CH=3\n" + BODY, time="a")
+    assert found.columns == ("a", "b", "c", "d")
 
 
 WIDE = [[7 * r + c * c for c in range(16)] for r in range(1, 31)]

@@ -4,7 +4,7 @@ wanted arrays are read."""
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,13 +43,13 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     with h5py.File(path, "r") as file:
         table = chosen(entries(file), wanted)
         saved = file.visititems(lambda name, one: {CLASS, OCTAVE} & set(one.attrs) or None)
-        facts = _facts(file, wanted.variable) if wanted.fields else {}
+        facts = _facts(file, table.array, wanted.fields) if wanted.fields else {}
         return replace(table, reversible=not saved, facts=facts)
 
 
-def _facts(file: h5py.File, name: str) -> dict[str, str]:
+def _facts(file: h5py.File, name: str, asked: Sequence[str]) -> dict[str, str]:
     """The attributes and single values of the file, of the groups around the array `name` and of
-    that array; the nearest counts."""
+    that array; the nearest counts. asked: paths of others."""
     found: dict[str, str] = {}
     at: Any = file
     for part in ("", *filter(None, name.split("/"))):
@@ -60,6 +60,12 @@ def _facts(file: h5py.File, name: str) -> dict[str, str]:
         single = {k: array_in(at, k) for k in inside if _is_single(at[k])}
         said = {**single, **at.attrs}
         found |= {normal(k): _said(v) for k, v in said.items() if np.size(v) == 1}
+    for path in asked:
+        at, rest = file, path.split("/")
+        while rest and _holds(at, rest[0]):
+            at = at[rest.pop(0)]
+        if not rest and _is_single(at):
+            found[path] = _said(array_in(file, path))
     return found
 
 

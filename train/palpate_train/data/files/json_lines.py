@@ -36,6 +36,9 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
         facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
         if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
             acquired, whole = inner, _acquired(inner)
+            facts |= {
+                normal(k): str(v) for k, v in inner.items() if isinstance(v, str | int | float)
+            }
         else:
             whole, said = _unwrapped(whole, wanted)
             notes += said
@@ -59,11 +62,13 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
 def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:
     """The list of frames in an object, and remarks; the object itself if it is a frame.
 
-    An object holds a list for each column, as pandas writes them in three ways, or one list of
+    An object holds a list for each column, as pandas writes them in four ways, or one list of
     frames beside facts about them. Raises FormatError.
     """
     if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
         return _rows(list(map(str, whole["columns"])), "columns", whole["data"], "data"), []
+    if _is_numbered(whole) and all(isinstance(v, dict) for v in whole.values()):
+        return list(whole.values()), []
     if all(isinstance(v, dict) and _is_numbered(v) for v in whole.values()):
         whole = {key: list(values.values()) for key, values in whole.items()}
     lists = {k: v for k, v in whole.items() if isinstance(v, list) and len(v) > 1}
@@ -89,9 +94,15 @@ def _acquired(payload: dict[str, Any]) -> list[dict[str, Any]]:
             f"payload.sensors is {excerpt(str(sensors))}; write an object with a name for each "
             "sensor there"
         )
+    names = [str(one["name"]) for one in each]
+    if len({*names}) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise FormatError(
+            f"payload.sensors has the name {twice!r} twice; give each sensor its own name there"
+        )
     if isinstance(values, list):
         values = [row if isinstance(row, list) else [row] for row in values]
-    return _rows([str(one["name"]) for one in each], "payload.sensors", values, "payload.values")
+    return _rows(names, "payload.sensors", values, "payload.values")
 
 
 def _rows(names: list[str], named_by: str, rows: Any, key: str) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ USUAL = 0.8
 """Share of the lines with digits that have a decoration, if it is removed."""
 _STAMP = r"(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d(?:[.,]\d+)?"
 _BARE = r":?(?=[ \t]+(?:\d|-(?!\d\d:?\d\d\b))[^ ]*[,;\t])"
-CLOCK = re.compile(rf"^\s*\[?({_STAMP})(?:\]|\s*->|{_BARE})\s*(.*)$")
+CLOCK = re.compile(rf"^\s*\[?({_STAMP})(?:\](?:\s*[,;\t])?|\s*->|{_BARE})\s*(.*)$")
 """The time that the serial monitor of Arduino, Tera Term in brackets, or CoolTerm before a blank,
 writes before a line."""
 LABEL = re.compile(r"(?<![\w.])([A-Za-z_][\w.\-\[\]]*)\s*[=:]\s*(?=[-+.\d])")
@@ -35,9 +35,12 @@ QUOTED = re.compile(r"'([^',;\t]*\d)'")
 HEXADECIMAL = re.compile(r"(?<![\w.])0[xX]([0-9a-fA-F]{1,8})(?![\w.])")
 FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d)")
 UNITS = re.compile(
-    r"(?<=\d)\s?(?:[kmuµn]?(?:N|V|A|Pa|g|Ω|Ohm)(?:/[cm]?m[2²])?|%|bar|psi|mmHg|°C|counts?)"
+    r"(?<=\d)(?:\s?(?:[kmuµnh]?(?:N|V|A|Pa|g|Ω|Ohm|T|gf|bar)(?:/[cm]?m[2²])?|[kmuµnpf]F|[kM]Hz|[muµ]m"
+    r"|%|psi|mmHg|°C|lbf?|oz|dB|LSB|raw|bits?|counts?)|\s(?:F|G|Hz|a\.u\.))"
     r"(?=\s*(?:[,;\t|\])]|$))"
 )
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+"""A colour of a terminal, in a log that was taken from one."""
 REMARK = re.compile(r"(?<=\d)\s+(?:#|//)\s.*$")
 """A comment behind the numbers of a line."""
 THOUSANDS = re.compile(r"(?<=\d)['’](?=\d{3}(?!\d))")
@@ -57,7 +60,7 @@ class PlainText:
 
 def plain(lines: Sequence[str]) -> PlainText:
     """The lines of a text without decorations."""
-    lines = [line.replace("\u2212", "-") for line in lines]
+    lines = [COLOUR.sub("", line).translate(_MINUS) for line in lines]
     some = [*lines[:SAMPLED], *lines[max(SAMPLED, len(lines) - SAMPLED) :]]
     some = [line for line in some if re.search(r"\d", line)]
     notes = []
@@ -142,6 +145,7 @@ class Rewriting:
 
 
 _NO_BRACKETS = str.maketrans("", "", "[](){}")
+_MINUS = str.maketrans("\u2212\u2013\uff0d", "---")
 _REWRITINGS = (
     Rewriting("comments behind numbers", REMARK.search, partial(REMARK.sub, ""), True),
     Rewriting("marks of bytes", BYTES.search, partial(BYTES.sub, r"\2")),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from palpate_train.data.files import text
 from palpate_train.data.files.table import ReadPlan, Table, normal
 
 SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
+LEAST_FRAMES = 8
+"""With fewer rows, or a single column of numbers, a sheet beside others holds facts."""
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:
@@ -36,6 +39,16 @@ def read(path: Path, wanted: ReadPlan) -> Table:
             if not str(e).startswith(text.NO_NUMBERS):
                 raise FormatError(f"sheet {name}: {e}") from e
             without = e
+    sizes = {
+        name: (len(one.values), one.values.shape[1] - len(one.texts))
+        for name, one in tables.items()
+    }
+    most = {name for name, (rows, columns) in sizes.items() if rows >= LEAST_FRAMES and columns > 1}
+    if most and not variable:
+        left = [f"sheet {name} is left out" for name in tables if name not in most]
+        tables = {
+            n: replace(one, notes=(*one.notes, *left)) for n, one in tables.items() if n in most
+        }
     if len(tables) > 1:
         raise FormatError(
             f"holds {len(tables)} sheets of frames, {', '.join(tables)}; name one with --variable"

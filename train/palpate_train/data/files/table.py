@@ -59,6 +59,7 @@ class Table:
     cell that is not a number, a message about the first. notes: remarks. facts: texts about the
     whole file by name, such as attributes. labels: texts for each frame by name. ends: the numbers
     of frames before the ends of its recordings, () for one recording.
+    array: the name of the array of `values`, "" for none.
     reversible: whether a program may have reversed the axes, and the file does not show it.
     """
 
@@ -73,6 +74,7 @@ class Table:
     facts: Mapping[str, str] = field(default_factory=dict)
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
     ends: tuple[int, ...] = ()
+    array: str = ""
 
 
 @dataclass(frozen=True)
@@ -179,8 +181,11 @@ def chosen(entries: Mapping[str, Entry], wanted: ReadPlan, ends: Sequence[int] =
         )
     vectors = {n: e for n, e in numbers.items() if e.is_vector and n != name}
     asked = {time: vectors[time].read().ravel()} if time in vectors else {}
-    labels = _labels(entries, wanted.fields, ends, len(table.values))
-    return replace(table, vectors=asked, beside=tuple(vectors), labels=labels, ends=tuple(ends))
+    texts = (*wanted.fields, *([] if time in vectors else [time]))
+    labels = _labels(entries, texts, ends, len(table.values))
+    only = next(iter(tables)) if len(tables) == 1 else ""
+    made = replace(table, vectors=asked, beside=tuple(vectors), labels=labels, array=only)
+    return replace(made, ends=tuple(ends))
 
 
 def _labels(

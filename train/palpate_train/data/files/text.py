@@ -142,7 +142,8 @@ def table(
         said.append(f"{between} comments between its frames are passed over")
     decimal = decimal or decimal_sign(rows, layout.delimiter, layout.cells)
     named = len(bare.names) == layout.wide
-    names = names or (bare.names if named else _heads(lines, kept[:start], layout))
+    asked = (wanted.time, *wanted.fields)
+    names = names or (bare.names if named else _heads(kept[:start], layout, asked))
     names, label = _row_names(names, rows, layout)
     layout = Layout(layout.delimiter, layout.wide, layout.text_columns | label)
     whole = _plain_numbers(rows, layout, decimal)
@@ -254,7 +255,7 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
             for k, (_, line) in enumerate(kept)
             if not _marked(line)
             and layout.is_frame(line)
-            and not _counts_columns(kept[k : k + 2], layout)
+            and not _counts_columns(kept[k : k + SAMPLED], layout)
             and not _is_summary(layout.cells(line), layout)
             and not _counts_frames(layout.cells(line), len(kept) - k - 1)
             and not _untimed(*(layout.cells(one) for _, one in (kept[k], kept[min(k + 1, last)])))
@@ -270,15 +271,26 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
 
 
 def _counts_columns(lines: Sequence[Row], layout: Layout) -> bool:
-    """Whether the first of two lines is a head that counts its columns: time,1,2,3, or ,0,1,2,3 of
-    pandas. Without a word, or if all frames begin with one, it has LEAST_COUNTED numbers. If the
-    line below begins alike, it is a frame."""
-    first, below = (list(map(_bare, layout.cells(line))) for _, line in (lines[0], lines[-1]))
+    """Whether the first of these lines is a head that counts its columns: time,1,2,3, or ,0,1,2,3
+    of pandas. If all frames begin with a word, it has LEAST_COUNTED numbers; without a word, these
+    or numbers that its columns do not reach below. If the line below begins alike, it is a frame.
+    """
+    first, below = (list(map(_bare, layout.cells(line))) for _, line in (lines[0], lines[:2][-1]))
     long = layout.wide > LEAST_COUNTED
     if is_number(first[0]):
-        return long and _is_count(first) and not _is_count(below)
+        apart = long or (len(first) > 2 and first[0] in ("0", "1") and _stands_out(lines, layout))
+        return apart and _is_count(first) and not _is_count(below)
     clear = long or (0 not in layout.text_columns and first[1] in ("0", "1"))
     return clear and _is_count(first[1:]) and first[0] != below[0]
+
+
+def _stands_out(lines: Sequence[Row], layout: Layout) -> bool:
+    """Whether each number of the first line lies outside of the range of those below it."""
+    rows = [[_bare(c) for c in layout.cells(line)] for _, line in lines if layout.is_frame(line)]
+    whole = [row for row in rows if all(map(is_number, row))]
+    values = np.array([[float(plain(cell, ".")) for cell in row] for row in whole])
+    below = values[1:]
+    return bool(len(below) and ((values[0] < below.min(0)) | (values[0] > below.max(0))).all())
 
 
 def _is_count(found: Sequence[str]) -> bool:
@@ -374,9 +386,10 @@ def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[
     return [f"read up to line {i}, which is {excerpt(line.strip())}"]
 
 
-def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple[str, ...]:
+def _heads(before: Sequence[Row], layout: Layout, asked: Sequence[str]) -> tuple[str, ...]:
     """The names of the columns: the cells of the last line before the frames that has as many, or
-    one fewer as in R. A line of units is passed over."""
+    one fewer as in R. Lines of units and of numbers behind a word are passed over, and those
+    without the names `asked` if a line has them."""
     comments = [line.lstrip("#% ") for _, line in before if _marked(line)]
     others = [line for _, line in before if not _marked(line)]
     for wide in (layout.wide, layout.wide - 1):
@@ -386,6 +399,10 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
             heads = [h for h in heads if not all(map(QUANTITY.fullmatch, h[1:]))] or heads
             heads = [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads
+            heads = [h for h in heads if not all(map(is_number, h[1:]))] or heads
+            heads = [
+                h for h in heads if {*map(normal, h)}.intersection(filter(None, asked))
+            ] or heads
             # ranges, gains and types repeat
             if named := [h for h in heads if len({*h}) == len(h)] or heads:
                 return tuple(map(normal, named[-1]))

@@ -61,7 +61,7 @@ def _read(root: Any, wanted: ReadPlan) -> Table:
             f"{name} ends at {ends[-1]}, but there are {count} frames; name their array with"
             " --variable"
         )
-    at = wanted.variable if "/" in wanted.variable else ""
+    at = table.array
     groups = [root]
     groups += [
         one
