@@ -61,8 +61,6 @@ APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
 MARGIN = 1.2
 """A speed within this factor of the trained range counts as trained."""
-SILENT = 1e-6
-"""A taxel with less than this share of the power of the strongest taxel is silent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +126,13 @@ class SlideMeter:
 
     def _tables(self, hz: Array, seconds: float) -> None:
         """Cosine, sine and use of each separation and frequency at each speed of the grid, and
-        without a lag at last: [3, D * F, V + 1]."""
-        speeds, hz = np.append(self._taxels_s, np.inf), hz[:, None]
-        lag_s = np.arange(1, SEPARATIONS + 1)[:, None, None] / speeds
+        without a lag at last: [3, 1, V + 1, D * F], whose rows are quick to multiply by one."""
+        speeds = np.append(self._taxels_s, np.inf)[:, None, None]
+        lag_s = np.arange(1, SEPARATIONS + 1)[:, None] / speeds
         phase = 2 * np.pi * hz * lag_s
         use = (hz <= WAVES * speeds) & (lag_s <= seconds / 2)
         tables = np.stack([np.cos(phase) * use, np.sin(phase) * use, use])
-        self._grid = tables.reshape(3, -1, len(speeds)).astype(np.float32)
+        self._grid = tables.reshape(3, 1, len(speeds), -1).astype(np.float32)
 
     def __call__(self, taxels: Counts) -> Slide:
         """The slide in one window of raw counts [T, R, C] or [T, R, C, A] of the format; only the
@@ -160,7 +158,7 @@ class SlideMeter:
         power = np.vecdot(parts, parts)
         if not math.isfinite(power.max()):
             power[~np.isfinite(power)] = 0
-        silent = power <= SILENT * power.max()
+        silent = power == 0
         heard = len(power) - int(np.count_nonzero(silent))
         if heard < LEAST_TAXELS:
             return None
@@ -185,7 +183,7 @@ class SlideMeter:
         first, second = size.take(self._pairs, 0)
         spread = self._of_pair @ (first * second)
         given = np.array([sums.real, sums.imag, spread.reshape(2, -1) / 2])
-        straight, across, variance = given @ self._grid
+        straight, across, variance = np.vecdot(given[:, :, None], self._grid)
         heights = np.array([straight - across, straight + across])
         heights /= np.sqrt(np.maximum(variance, TINY))
         return heights
