@@ -90,10 +90,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def launched() -> Iterator[Any]:
     """A browser for the module; while it is open, asyncio.run of another test would fail."""
     with browsers.launched() as one:
         yield one
+
+
+@pytest.fixture
+def browser(launched: Any) -> Iterator[Any]:
+    """The browser; what a test opens in it is closed."""
+    yield launched
+    for context in launched.contexts:
+        context.close()
 
 
 @pytest.fixture(scope="session")

@@ -73,10 +73,22 @@ Counts on taxels are left out, because their colours change.
 
 
 class BrowsedPage:
-    """A page in the browser. errors: the browser's messages. requests: the requested addresses."""
+    """A page in a context of its own. size: width and height. prepare: called with the context
+    before the page is opened. errors: the browser's messages. requests: the requested addresses."""
 
-    def __init__(self, context: Any, address: str) -> None:
-        self.page, self.errors, self.requests = context.new_page(), [], []
+    def __init__(
+        self,
+        browser: Any,
+        address: str,
+        size: tuple[int, int] = (1280, 720),
+        scheme: str = "light",
+        prepare: Callable[[Any], object] = lambda context: None,
+        **more: Any,
+    ) -> None:
+        viewport = dict(zip(("width", "height"), size, strict=True))
+        self.context = browser.new_context(viewport=viewport, color_scheme=scheme, **more)
+        prepare(self.context)
+        self.page, self.errors, self.requests = self.context.new_page(), [], []
         self.page.on("console", lambda message: self.errors.append(message.text))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))

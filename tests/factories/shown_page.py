@@ -90,9 +90,6 @@ def opened(
     browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40
 ) -> BrowsedPage:
     """The page in a browser, with all of the shift."""
-    seen = BrowsedPage(
-        browser.new_context(viewport={"width": width, "height": height}),
-        shown.server.address + "/#watch",
-    )
+    seen = BrowsedPage(browser, shown.server.address + "/#watch", (width, height))
     until(lambda: seen.page.locator(".row").count() == rows)
     return seen

@@ -111,8 +111,7 @@ def test_its_pages_and_status_say_which_finger_and_each_thing_once(
 ):
     """A good finger shows no alarm, and a skin card with its name. No fact of its status comes
     twice."""
-    context = browser.new_context()
-    seen = BrowsedPage(context, f"{pair.page(name)}/#watch")
+    seen = BrowsedPage(browser, f"{pair.page(name)}/#watch")
     tones: set[str] = set()
 
     def good() -> bool:
@@ -124,7 +123,6 @@ def test_its_pages_and_status_say_which_finger_and_each_thing_once(
     assert not tones & {"warn", "bad"}
     assert seen.text("#skin-title") == f"Skin of {name}"
     assert not seen.errors
-    context.close()
     heads = [line.split()[0] for line in pair.status(name)]
     facts = [head for head in heads if head != "sweep"]
     assert len(facts) == len(set(facts)) > 3

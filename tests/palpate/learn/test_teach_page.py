@@ -40,8 +40,8 @@ class Hand:
     """A person with gloves: presses buttons, and counts how often."""
 
     def __init__(self, browser: Any, box: TaughtBox) -> None:
-        self.context = browser.new_context(viewport={"width": 1024, "height": 768})
-        self.seen, self.box, self.clicks = BrowsedPage(self.context, box.address), box, 0
+        self.seen = BrowsedPage(browser, box.address, (1024, 768))
+        self.box, self.clicks = box, 0
         self.page = self.seen.page
         self.page.set_default_timeout(WAIT_MS)
 
@@ -142,7 +142,7 @@ def test_browsers_and_skin_come_and_go(browser, box):
     hand.add("oak")
     hand.slide_until_counted("oak")
     other.until("#count", lambda text: text == f"sweep 2 of {EACH}")
-    other.context.close()
+    other.page.context.close()
     hand.slide_until_counted("oak")
     box.player.unplug()
     hand.page.wait_for_selector("#banner:visible")
@@ -152,7 +152,7 @@ def test_browsers_and_skin_come_and_go(browser, box):
     hand.slide_until_counted("oak")
     box.stop(kill=True)
     hand.page.wait_for_selector("#banner:visible")
-    hand.context.close()
+    hand.page.context.close()
     box.start("--sweeps", str(EACH))
     hand = Hand(browser, box)
     hand.page.wait_for_selector("text=oak: 3")
@@ -163,10 +163,10 @@ def test_browsers_and_skin_come_and_go(browser, box):
 
 def test_no_name_is_lost_while_the_page_cannot_send(browser, box):
     """Before the first event, and while an order is not answered, a typed name stays."""
-    context = browser.new_context()
     news = re.compile(r"/events\?")
-    context.route(news, lambda route: route.abort())
-    page = BrowsedPage(context, box.address).page
+    silent = lambda context: context.route(news, lambda route: route.abort())  # noqa: E731
+    page = BrowsedPage(browser, box.address, prepare=silent).page
+    context = page.context
     assert page.get_attribute("#add-button", "aria-disabled") == "true"
     page.fill("#name", "oak")
     page.press("#name", "Enter")
@@ -184,7 +184,6 @@ def test_no_name_is_lost_while_the_page_cannot_send(browser, box):
     held[0].continue_()
     page.wait_for_selector("[data-material=oak]")
     assert page.input_value("#name") == "cork"
-    context.close()
 
 
 def test_the_page_refuses_what_cannot_be(browser, box):

@@ -99,8 +99,7 @@ def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict
 def test_the_whole_way(browser, box):
     """The real command: the page waits, advises, follows a touch; then "no connection"."""
     run, address = box
-    context = browser.new_context(viewport={"width": 820, "height": 1180})
-    seen = BrowsedPage(context, address)
+    seen = BrowsedPage(browser, address, (820, 1180))
     advice = re.compile(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1")
     wanted = lambda shown: shown["state"] == "off" and bool(advice.fullmatch(shown["message"]))  # noqa: E731
     off = reached(seen, wanted)
@@ -122,13 +121,11 @@ def test_the_whole_way(browser, box):
     seen.state("no-connection")
     assert seen.text("#message") == "no connection"
     assert {url.removeprefix(address).split("?")[0] for url in seen.requests} <= FILES
-    context.close()
 
 
 def test_the_page_draws_what_the_box_says(browser, page):
     """Loads, points at their coordinates, and the message, also for screen readers."""
-    context = browser.new_context(viewport={"width": 1180, "height": 820})
-    seen = BrowsedPage(context, page.address)
+    seen = BrowsedPage(browser, page.address, (1180, 820))
     seen.state("off")
     assert seen.text("#message") == VIEW.message
     assert seen.page.text_content("#spoken").startswith(VIEW.message)
@@ -163,7 +160,6 @@ def test_the_page_draws_what_the_box_says(browser, page):
     assert seen.page.locator(".tile").count() == 6
     assert "0.5, column 1.0" in seen.text("#figures")
     assert seen.errors == []
-    context.close()
 
 
 def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
@@ -210,7 +206,7 @@ def test_the_arrow_points_where_the_skin_has_to_go(browser, page, centre, messag
         zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre)
     )
     page.show(replace(VIEW, message=message, centre=centre, nearest=nearest))
-    seen = BrowsedPage(browser.new_context(), page.address)
+    seen = BrowsedPage(browser, page.address)
     seen.state("off")
     line = str(seen.page.locator("#way .line").get_attribute("d"))
     path = [float(n) for n in re.findall(r"-?[\d.]+", line)]
@@ -221,7 +217,6 @@ def test_the_arrow_points_where_the_skin_has_to_go(browser, page, centre, messag
     pushed = turned["c"] * -1, turned["d"] * -1  # where the arrow's head, at (0, -1), has got to
     for arrow in (drawn, pushed):
         assert (arrow[0] * way[0] + arrow[1] * way[1]) / hypot(*arrow) > 0.9
-    seen.page.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -229,14 +224,12 @@ def test_every_count_can_be_read_on_its_taxel(browser, page, scheme):
     """A contrast of 4.5 from no load to the full one (WCAG 2.1, 1.4.3)."""
     rising = tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4))
     page.show(replace(VIEW, load=rising, full=15.0))
-    context = browser.new_context(color_scheme=scheme)
-    seen = BrowsedPage(context, page.address)
+    seen = BrowsedPage(browser, page.address, scheme=scheme)
     seen.state("off")
     tiles, counts = (seen.page.eval_on_selector_all(which, FILLS) for which in (".tile", ".count"))
     assert len(tiles) == 16
     assert len({tuple(one) for one in counts}) == 2  # black on light ones, white on dark ones
     assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5
-    context.close()
 
 
 @pytest.mark.parametrize(
@@ -250,7 +243,7 @@ def test_every_count_can_be_read_on_its_taxel(browser, page, scheme):
 )
 def test_the_picture_shows_which_end_is_the_fingertip(browser, page, side, at):
     """A cap at that side; where it is not set, the page says how to find it out."""
-    seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
+    seen = BrowsedPage(browser, page.address, (1024, 768))
     seen.state("off")
     assert seen.page.locator(".finger").count() == 0
     assert "press" in seen.text("#where")
@@ -262,7 +255,6 @@ def test_the_picture_shows_which_end_is_the_fingertip(browser, page, side, at):
     assert beyond(board, name) == at
     assert min(name["x"], name["y"]) >= 0
     assert not seen.page.is_visible("#where")
-    seen.page.close()
 
 
 def beyond(board: dict[str, float], box: dict[str, float]) -> str:
@@ -275,14 +267,12 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
 
 def test_a_box_that_says_nothing_new_is_no_news(browser, page):
     """A loop that hangs behind a server: the page says so and shows no old picture."""
-    context = browser.new_context()
-    seen = BrowsedPage(context, page.address)
+    seen = BrowsedPage(browser, page.address)
     seen.state("off")
     seen.state("no-connection")
     assert "answer" in seen.text("#hint")
     page.show(replace(VIEW, number=8))
     seen.state("off")
-    context.close()
 
 
 @pytest.mark.parametrize(
@@ -293,8 +283,7 @@ def test_it_fits_phone_tablet_and_desktop(browser, page, width, height, scheme):
     """All on one screen without scrolling, light and dark, with enough contrast."""
     longest = "12.5 mm too far towards column 4 and 10.5 mm towards row 4"
     page.show(replace(VIEW, message=longest, source="sim"))
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    seen = BrowsedPage(context, page.address)
+    seen = BrowsedPage(browser, page.address, (width, height), scheme)
     seen.state("off")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     assert seen.page.evaluate("document.documentElement.scrollHeight") <= height
@@ -307,7 +296,6 @@ def test_it_fits_phone_tablet_and_desktop(browser, page, width, height, scheme):
         assert box["x"] + box["width"] <= width
         assert contrast(style(seen, what, "color"), style(seen, "body", "backgroundColor")) >= 4.5
     assert (luminance(style(seen, "body", "backgroundColor")) > 0.5) == (scheme == "light")
-    context.close()
 
 
 def style(seen: BrowsedPage, what: str, name: str) -> list[float]:

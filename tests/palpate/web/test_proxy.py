@@ -53,7 +53,7 @@ def test_a_path_of_its_own(browser, tmp_path):
     with Shown(Access(0)) as shown, proxy(tmp_path, "/cells/palpate/", port_of(shown)) as port:
         shown.shift()
         address = f"http://localhost:{port}/cells/palpate/"
-        seen = BrowsedPage(browser.new_context(), f"{address}#watch")
+        seen = BrowsedPage(browser, f"{address}#watch")
         until(lambda: seen.page.locator(".row").count() == 40)
         until(lambda: "16 taxels" in str(seen.page.get_attribute("#signal", "aria-label")))
         seen.page.goto(f"{address}#history")

@@ -42,12 +42,9 @@ def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
         yield one
 
 
-def opened(
-    browser: Any, recorded: RecordedPage, width: int = 1024, height: int = 768, **more: Any
-) -> BrowsedPage:
+def opened(browser: Any, recorded: RecordedPage) -> BrowsedPage:
     """The page in a browser, with its content."""
-    context = browser.new_context(viewport={"width": width, "height": height}, **more)
-    seen = BrowsedPage(context, recorded.page.server.address)
+    seen = BrowsedPage(browser, recorded.page.server.address, (1024, 768))
     until(lambda: seen.page.locator("#counts button").count() == 4)
     until(lambda: seen.page.locator(".skin .tile").count() == 16)
     return seen
@@ -183,15 +180,13 @@ def test_without_a_material_nothing_is_started(browser: Any, tmp_path: Path, tea
     """The page asks for a name first, and Start can do nothing until there is one."""
     start = "#sweep-button" if teaching else "#start"
     with RecordedPage(tmp_path, Labels("", "1"), teaching=teaching) as one:
-        context = browser.new_context()
-        seen = BrowsedPage(context, one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address)
         until(lambda: seen.text("#state") == "ready")
         assert seen.page.get_attribute(start, "aria-disabled") == "true"
         seen.page.keyboard.press("Space")
         one.recording.commands["MATERIAL"]("wood")
         seen.page.wait_for_selector(f"{start}:not([aria-disabled=true])")
         assert "START" not in one.done
-        context.close()
 
 
 @LOOKS
@@ -199,9 +194,7 @@ def test_without_a_material_nothing_is_started(browser: Any, tmp_path: Path, tea
 def test_timed_sweeps_are_counted_down(browser, tmp_path, width, height, scheme, teaching):
     """In sight, in letters of 96 px or more; a skin that is away has no countdown."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
-        size = {"width": width, "height": height}
-        context = browser.new_context(viewport=size, color_scheme=scheme)
-        seen = BrowsedPage(context, one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address, (width, height), scheme)
         for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
             due_ns = SystemClock().now_ns() + 60 * SECOND
             one.health = one.health._replace(due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
@@ -216,7 +209,6 @@ def test_timed_sweeps_are_counted_down(browser, tmp_path, width, height, scheme,
         one.health = one.health._replace(skin="lost", trouble="unplugged", due_ns=0)
         until(lambda: seen.text("#call") == seen.text("#countdown") == "")
         assert not seen.errors
-        context.close()
 
 
 def test_the_sweep_on_the_button_is_discarded(browser, recorded, tmp_path):
@@ -250,7 +242,6 @@ def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser, tmp
         assert seen.page.input_value("#material") == "paper"
         seen.page.click("#set")
         until(lambda: labels(second) == ("paper", "1", "monday"))
-        seen.page.context.close()
 
 
 CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
@@ -268,9 +259,7 @@ def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
         recorded.recording.commands["POSITION"](f"{position}")
         recorded.sweep()
     recorded.sweep(Status.STUCK_TAXEL, "taxel 1.4")
-    size = {"width": width, "height": height}
-    context = browser.new_context(viewport=size, color_scheme=scheme)
-    seen = BrowsedPage(context, recorded.page.server.address)
+    seen = BrowsedPage(browser, recorded.page.server.address, (width, height), scheme)
     until(lambda: seen.page.locator("#counts button").count() == 3 * 14)
     seen.page.fill("#session", "-")
     seen.page.click("#set")
@@ -286,7 +275,6 @@ def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
         assert seen.page.evaluate(CUT) == []
     assert [one for one in seen.errors if "409" not in one] == []
-    seen.page.context.close()
 
 
 def test_everything_on_it_has_a_role_and_a_name(browser, recorded):
@@ -339,7 +327,7 @@ def test_a_sweep_that_looks_like_another_material_is_moved(browser: Any, tmp_pat
         learnt = {"accuracy": 0.9, "low": 0.8, "high": 1, "text": "", "advice": ""}
         held = {**TAUGHT["teach"], "materials": {"metal": 1, "wood": 0}}
         one.more = {"teach": held | {"learnt": learnt | {"suspects": suspects}}}
-        seen = BrowsedPage(browser.new_context(), one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address)
         until(lambda: seen.page.locator("#suspects li").count() == 2)
         assert seen.page.locator("#suspects button").count() == 1
         seen.page.click("#suspects button")
@@ -349,7 +337,6 @@ def test_a_sweep_that_looks_like_another_material_is_moved(browser: Any, tmp_pat
         until(lambda: one.recording.about()["material"] == "iron")
         until(lambda: seen.page.input_value("#name") == "")  # once the reply has come
         assert not seen.errors
-        seen.page.context.close()
 
 
 COVERED = """() => {
@@ -379,9 +366,7 @@ def test_a_person_sees_each_control_of_a_page(
         held = {**TAUGHT["teach"], "materials": {"metal": 1, "wood": 3}}
         if teaching:
             one.more = {"teach": held | {"learnt": learnt | {"suspects": [suspect]}}}
-        size = {"width": width, "height": height}
-        context = browser.new_context(viewport=size, color_scheme=scheme)
-        seen = BrowsedPage(context, one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address, (width, height), scheme)
         for order in (("MOVE", f"{number},wood"), ("MATERIAL", "metal")):
             one.recording.commands[order[0]](order[1])
         for where in ("#move", "#undo", "#rename"):
@@ -392,7 +377,6 @@ def test_a_person_sees_each_control_of_a_page(
         assert seen.legibility()[1] == []
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
         assert not seen.errors
-        context.close()
 
 
 OLDER = """
@@ -403,9 +387,8 @@ for (const [of, name] of [[Array.prototype, "at"], [Element.prototype, "replaceC
 
 def test_orders_of_an_older_browser_are_sent(browser: Any, recorded: RecordedPage):
     """Of 2020; an error of script stops no later order."""
-    context = browser.new_context()
-    context.add_init_script(OLDER)
-    seen = BrowsedPage(context, recorded.page.server.address)
+    older = lambda context: context.add_init_script(OLDER)  # noqa: E731
+    seen = BrowsedPage(browser, recorded.page.server.address, prepare=older)
     until(lambda: seen.page.locator("#counts button").count() == 4)
     seen.page.click("#next:not([aria-disabled=true])")
     until(lambda: seen.text("#said") == "next position")
@@ -417,17 +400,15 @@ def test_orders_of_an_older_browser_are_sent(browser: Any, recorded: RecordedPag
     seen.page.evaluate("window.fetch = window.kept")
     seen.page.click("#next:not([aria-disabled=true])")
     until(lambda: recorded.done.count("NEXT") == 2)
-    context.close()
 
 
 def test_a_browser_that_is_too_old_says_so(browser: Any, recorded: RecordedPage):
     """Its modules do not run: one sentence, by a script that it understands."""
-    context = browser.new_context()
-    context.route("**/parts.js", lambda route: route.fulfill(body="a ??== 1", content_type=JS))
-    seen = BrowsedPage(context, recorded.page.server.address)
+    newer = lambda route: route.fulfill(body="a ??== 1", content_type=JS)  # noqa: E731
+    prepare = lambda context: context.route("**/parts.js", newer)  # noqa: E731
+    seen = BrowsedPage(browser, recorded.page.server.address, prepare=prepare)
     until(lambda: seen.page.is_visible("#banner"))
     assert "too old" in seen.text("#banner")
-    context.close()
 
 
 @LOOKS
@@ -436,9 +417,7 @@ def test_finish_ends_the_page_in_words(
 ):
     """Done, with the way to the other page, and no red bar when the program has gone."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=True) as one:
-        size = {"width": width, "height": height}
-        context = browser.new_context(viewport=size, color_scheme=scheme)
-        seen = BrowsedPage(context, one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address, (width, height), scheme)
         trying = {"model": "mine 1", "labels": ["metal"], "displays": {}, "taught": "here"}
         one.more = {"trying": trying | {"alike": ["metal", "wood"]}}
         one.recording.commands["DONE"] = lambda text: []
@@ -451,18 +430,17 @@ def test_finish_ends_the_page_in_words(
     assert seen.text("#count").startswith("The box works")
     assert seen.legibility()[1] == []
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
-    context.close()
 
 
 def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
     """A browser has six connections to a box, for all of its tabs; seen again it goes on."""
-    context = browser.new_context()
-    context.add_init_script(
+    hiding = (
         "let seen = 'visible'; window.show = (s) => { seen = s; "
         "document.dispatchEvent(new Event('visibilitychange')); };"
         "Object.defineProperty(document, 'visibilityState', {get: () => seen});"
     )
-    seen = BrowsedPage(context, recorded.page.server.address)
+    prepare = lambda context: context.add_init_script(hiding)  # noqa: E731
+    seen = BrowsedPage(browser, recorded.page.server.address, prepare=prepare)
     until(lambda: len(recorded.page.server.queues) == 1)
     seen.page.evaluate("window.show('hidden')")
     until(lambda: not recorded.page.server.queues, 30)
@@ -471,7 +449,6 @@ def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
     number = recorded.sweep()
     until(lambda: seen.text("#sweep-title").startswith(f"Sweep {number},"))
     assert not seen.errors
-    context.close()
 
 
 def test_a_material_may_be_called_as_things_of_script(browser, recorded):

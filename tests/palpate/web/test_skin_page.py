@@ -35,7 +35,7 @@ def page() -> Iterator[PageServer]:
 
 def test_it_shows_loads_figures_and_faults(browser, page):
     """A map for each axis; faulty taxels outlined; unknown loss is not called 0."""
-    seen = BrowsedPage(browser.new_context(), page.address)
+    seen = BrowsedPage(browser, page.address)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.text("#lost") == "cannot be known"
     assert re.match("stuck: 1.2 .*dead: 2.1 ", seen.text("#faults"))
@@ -49,12 +49,11 @@ def test_it_shows_loads_figures_and_faults(browser, page):
     scripts = {f"/{name}.js" for name in ("old", "skin_show", "events", "parts", "skin")}
     assert asked <= {"/", "/page.css", "/events", "/logo.svg"} | scripts
     assert not seen.errors
-    seen.page.close()
 
 
 def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser, page):
     """A missing skin has a reason, a dead box has no news; news bring the page back."""
-    seen = BrowsedPage(browser.new_context(), page.address)
+    seen = BrowsedPage(browser, page.address)
     page.show(replace(VIEW, number=2, state="lost", trouble="the skin was unplugged"))
     until(lambda: seen.text("#state") == "lost")
     assert seen.text("#trouble") == "the skin was unplugged"
@@ -62,14 +61,12 @@ def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser, page
     page.show(replace(VIEW, number=3))
     until(lambda: seen.text("#state") == "streaming")
     assert not seen.page.is_visible("#trouble")
-    seen.page.close()
 
 
 @LOOKS
 def test_nothing_is_cut_off(browser, page, width, height, scheme):
     """No wider than the screen; counts have a contrast of 4.5 at least (WCAG 2.1, 1.4.3)."""
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    seen = BrowsedPage(context, page.address)
+    seen = BrowsedPage(browser, page.address, (width, height), scheme)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     tiles, counts = (
@@ -78,7 +75,6 @@ def test_nothing_is_cut_off(browser, page, width, height, scheme):
     )
     assert len(tiles) == 36
     assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5
-    context.close()
 
 
 COLOURS = "all => all.map(e => getComputedStyle(e).%s.match(/\\d+/g).slice(0, 3).map(Number))"

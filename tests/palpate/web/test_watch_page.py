@@ -133,7 +133,6 @@ def test_a_large_skin_is_drawn_without_numbers(browser, shown, width, height):
             )
             assert apart >= -1
     assert seen.page.locator("#centre").bounding_box()["width"] > 12
-    seen.page.context.close()
 
 
 def test_loss_latency_and_the_box(browser, shown):
@@ -161,7 +160,6 @@ def test_unsigned_bundles_are_told_at_the_top(browser, shown):
                 assert 0 <= box["x"] < box["x"] + box["width"] <= width
                 assert box["y"] < height / 2
                 assert "allow_unsigned" in seen.text("#facts")
-            seen.page.context.close()
 
 
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser, shown):
@@ -213,7 +211,6 @@ def test_a_page_program_that_dies_and_comes_back(browser):
         until(lambda: not seen.page.is_visible("#banner"))
         until(lambda: seen.page.locator(".row").count() == 0)
         assert seen.text("#state") == "ready"
-        seen.page.context.close()
 
 
 def test_it_is_used_with_the_keyboard(browser, shown):
@@ -276,8 +273,7 @@ def test_every_text_can_be_read(browser, shown, width, height, scheme, at):
     for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
         moved = "moved 2 mm too far towards row 1"
         shown.board.take(feed_lines.verdict(number, 390.0, "wood", status, moved=moved))
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
-    seen = BrowsedPage(context, shown.server.address + at)
+    seen = BrowsedPage(browser, shown.server.address + at, (width, height), scheme)
     until(lambda: seen.page.locator(".row").count() == 44 or at != "/#watch")
     seen.state("off")
     for act in (lambda: None, lambda: shown.board.away("it was stopped")):
@@ -288,7 +284,6 @@ def test_every_text_can_be_read(browser, shown, width, height, scheme, at):
         assert faint == []
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     assert not seen.errors
-    context.close()
 
 
 def test_nothing_moves_when_something_new_comes(browser, shown):
@@ -320,8 +315,7 @@ def test_on_a_tablet_in_the_network(browser, tmp_path):
     with shown:
         shown.shift()
         address = f"https://localhost:{shown.server.address.rsplit(':', 1)[1]}"
-        context = browser.new_context(ignore_https_errors=True)
-        seen = BrowsedPage(context, address)
+        seen = BrowsedPage(browser, address, ignore_https_errors=True)
         assert seen.page.evaluate("document.activeElement.id") == "token"
         for wrong, said in (
             ("nonsense", "this is not the token"),
@@ -337,8 +331,6 @@ def test_on_a_tablet_in_the_network(browser, tmp_path):
         until(lambda: seen.page.is_visible("#there dd"))
         assert token not in seen.page.url
         assert token not in "".join(seen.requests)
-        other = BrowsedPage(browser.new_context(ignore_https_errors=True), f"{address}/#{token}")
+        other = BrowsedPage(browser, f"{address}/#{token}", ignore_https_errors=True)
         until(lambda: other.page.is_visible("#there dd"))
         assert token not in other.page.url
-        other.page.context.close()
-        context.close()

@@ -106,9 +106,7 @@ def fits(seen: BrowsedPage, width: int, height: int) -> None:
 @LOOKS
 def test_each_state_is_told_from_two_metres(browser, shown, width, height, scheme):
     """By colour, shape and word, with what to do, readable."""
-    size = {"width": width, "height": height}
-    context = browser.new_context(viewport=size, color_scheme=scheme)
-    seen = BrowsedPage(context, shown.server.address + "/#watch")
+    seen = BrowsedPage(browser, shown.server.address + "/#watch", (width, height), scheme)
     until(lambda: seen.page.locator(".row").count() == 40)
     looks = {tone: set() for tone in ("good", "warn", "bad", "away", "plain")}
     for act, *told in STATES:
@@ -123,7 +121,6 @@ def test_each_state_is_told_from_two_metres(browser, shown, width, height, schem
     colours, signs = zip(*(one.pop() for one in looks.values()), strict=True)
     assert len({*colours}) == len({*signs}) == 5
     assert not seen.errors
-    context.close()
 
 
 def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
@@ -192,9 +189,8 @@ DEVICE = """() => {
 
 def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser, shown):
     """The screen is kept on; if wanted, a refusal sounds once, an answer not."""
-    context = browser.new_context()
-    context.add_init_script(f"({DEVICE})()")
-    seen = BrowsedPage(context, shown.server.address + "/#watch")
+    device = lambda context: context.add_init_script(f"({DEVICE})()")  # noqa: E731
+    seen = BrowsedPage(browser, shown.server.address + "/#watch", prepare=device)
     until(lambda: seen.page.locator(".row").count() == 40)
     until(lambda: seen.page.evaluate("window.locks") == 1)
     assert "screen" in seen.text("#awake")
@@ -212,7 +208,6 @@ def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser, shown):
     until(lambda: seen.text("#label") == "wood")
     assert len(seen.page.evaluate("window.tones")) == 4
     assert not seen.errors
-    context.close()
 
 
 def test_keys_lead_to_views_and_history(browser, shown):
@@ -267,7 +262,7 @@ def test_history_goes_on_after_a_restart(browser, tmp_path):
         file.close()
     with Shown(Access(0), memory=tmp_path / "verdicts.db") as one:
         one.shift()
-        seen = BrowsedPage(browser.new_context(), one.server.address + "/#history")
+        seen = BrowsedPage(browser, one.server.address + "/#history")
         for period, counted in (("0", "2"), ("30", "4")):
             seen.page.click(f"[data-period='{period}']")
             until(lambda counted=counted: seen.text("#past-counted").startswith(f"{counted} sw"))
@@ -284,7 +279,7 @@ def test_the_start_leads_to_each_page(browser, shown):
     """Views, other boxes, teaching; no link that runs a script."""
     evil, cell = "javascript:alert(1)", "https://cell-7.local:8137/"
     shown.boxes += [{"name": "evil", "address": evil}, {"name": "cell-7", "address": cell}]
-    seen = BrowsedPage(browser.new_context(), shown.server.address)
+    seen = BrowsedPage(browser, shown.server.address)
     until(lambda: "palpate, streaming" in seen.text("#there"))
     until(lambda: seen.text("#start-history").startswith("40 sweeps"))
     until(lambda: seen.page.locator("#boxes a").count() == 1)
@@ -322,7 +317,6 @@ def test_long_names_and_many_materials_are_not_cut(browser, shown, width, height
     )
     assert wide == []
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
-    seen.page.context.close()
 
 
 def test_a_taxel_of_a_large_skin_tells_its_value(browser, shown):
@@ -342,4 +336,3 @@ def test_a_taxel_of_a_large_skin_tells_its_value(browser, shown):
         shown.board.take(line | {"time_ns": round(390 * feed_lines.SECOND)})
         until(lambda: seen.text("#taxel") == said)  # noqa: B023
         assert not seen.errors
-        seen.page.context.close()

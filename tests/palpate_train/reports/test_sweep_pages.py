@@ -83,7 +83,7 @@ def address(tmp_path: Path) -> str:
 @pytest.mark.slow
 def test_arrow_keys_turn_the_page(browser: Any, address: str):
     """One at a time, within the ends, and the address names it."""
-    seen_page = BrowsedPage(browser.new_context(), address)
+    seen_page = BrowsedPage(browser, address)
     page = seen_page.page
 
     def seen() -> list[str]:
