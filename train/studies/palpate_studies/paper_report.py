@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from palpate_studies import TEMPLATES, differences
+from palpate_studies import TEMPLATES, comparison, differences
 from palpate_studies.paper_experiment import ATTACHMENTS, BLIND, HARD, HARD_BLIND, OWN
 from palpate_studies.paper_values import CNN, CONFUSION, FIGURES, FIVE, short_name
 from palpate_train.reports import confusion_plot, html, provenance
-from palpate_train.reports.formatting import estimate, exact_percent, points, seconds
+from palpate_train.reports.formatting import estimate, exact_percent, seconds
 
 TITLES = {
     "lopo": "T-REAL, leave one position out",
@@ -105,8 +105,7 @@ def _gap(ours: Row, other: Row | None) -> str:
     if other is None:
         return "–"
     one, two = (tuple(row["share"]) for row in (ours, other))
-    gap, low, high = (points(value, sign=True) for value in differences.difference(one, two))
-    return f"{gap} [{low}, {high}]"
+    return comparison.shown(differences.difference(one, two))
 
 
 def _match(rows: Mapping[Key, Row]) -> dict[str, Any]:

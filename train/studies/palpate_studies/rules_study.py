@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,17 +27,6 @@ PAIRS = (
 """Rules that refuse or mend some of the same sweeps."""
 TURNS = 9
 """Number of times that each bundle answers the slides while its processor time is taken."""
-MODULES = {
-    "early": ("palpate.answer.early", "palpate_train.answer.fit_early"),
-    "disturbance": ("palpate.answer.disturbance", "palpate_train.answer.fit_disturbance"),
-    "displacement": ("palpate.answer.contact", "palpate_train.answer.fit_displacement"),
-    "vibration": ("palpate.answer.vibration", "palpate_train.answer.fit_slide"),
-    "slide": ("palpate.answer.slide", "palpate_train.answer.fit_slide"),
-    "hum": ("palpate.answer.hum", "palpate_train.answer.fit_hum"),
-    "taxels": ("palpate.answer.taxels", "palpate_train.answer.fit_taxels"),
-    "unknown": ("palpate.answer.unknown", "palpate_train.answer.fit_unknown"),
-}
-"""The modules of each rule, on the box and on the desktop."""
 
 
 def results(
@@ -59,7 +46,7 @@ def results(
 
 def rows(bundle: Bundle, given: list[trial.Given], log: Callable[[str], None]) -> Iterator[Json]:
     """For each rule that is left out, and each of PAIRS: `total`, `right` and `wrong` answers by
-    kind of sweep, processor time of an answer in milliseconds, and lines of its modules."""
+    kind of sweep, and processor time of an answer in milliseconds."""
     there = rules.present(bundle)
     alone: list[tuple[str, ...]] = [(), *((name,) for name in there)]
     every = alone + [pair for pair in PAIRS if set(pair) <= set(there)]
@@ -79,7 +66,6 @@ def rows(bundle: Bundle, given: list[trial.Given], log: Callable[[str], None]) -
             "right": {kind: of.right for kind, of in counts.items()},
             "wrong": {kind: of.wrong for kind, of in counts.items()},
             "ms": ms,
-            "lines": sum(map(_lines, {m for name in names for m in MODULES[name]})),
         }
 
 
@@ -95,7 +81,3 @@ def _took(bundles: list[Bundle], sweeps: Dataset) -> list[float]:
                 pass
             turn[i] = 1e3 * (time.process_time() - begun) / len(sweeps)
     return [round(float(ms), 3) for ms in np.median(took[1:], axis=0)]
-
-
-def _lines(module: str) -> int:
-    return len(Path(str(import_module(module).__file__)).read_text().splitlines())

@@ -19,7 +19,6 @@ def table(results: Mapping[str, Any], pairs: bool = True) -> str:
     for row in (first, *others):
         name = " and ".join(row["without"]) or "(every rule)"
         counts = [f"{row['right'][kind]}, {row['wrong'][kind]}" for kind in kinds[:-1]]
-        cost = row["wrong"][kinds[-1]], f"{row['ms']:.2f}", row["lines"] or ""
-        rows.append([name, *counts, *cost])
+        rows.append([name, *counts, row["wrong"][kinds[-1]], f"{row['ms']:.2f}"])
     about = f"Bundle {results['bundle']}, {totals}."
-    return f"\n{markdown.table([*head, 'ms', 'lines'], rows, about)}\n"
+    return f"\n{markdown.table([*head, 'ms'], rows, about)}\n"
