@@ -111,6 +111,8 @@ def table():
 
 
 if __name__ == "__main__":
+    if not hasattr(time, "ticks_us"):
+        raise SystemExit("this Python is not MicroPython; use micropython budget.py")
     for line in table():
         print(line)
     for given in FORMS:
