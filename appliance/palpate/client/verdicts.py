@@ -7,13 +7,14 @@ the next is taken; the loop of the box knows nothing of it.
 from __future__ import annotations
 
 import math
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
-from palpate.core import wall_clock
+from palpate.core import storage, wall_clock
 from palpate.core.errors import FeedError, TemporaryError
 from palpate.core.log import log
 
@@ -47,22 +48,32 @@ clock. STRICT: SQLite would take a number of a wrong kind as bytes, which count 
 
 
 class VerdictFile:
-    """The file at `path`, None for verdicts in memory alone, for its one writer. A file that is
-    damaged or of another version is moved aside. db: to read with the functions below. Raises
-    TemporaryError if it cannot be opened."""
+    """The file at `path`, None for verdicts in memory alone, for its one writer, which locks the
+    folder: a second one would write each verdict again. A file that is damaged or of another
+    version is moved aside. db: to read with the functions below. Raises TemporaryError if it cannot
+    be opened."""
 
     def __init__(self, path: Path | None, *, most_mib: float = MOST_MIB) -> None:
         self._path, self._most, self._since = path, most_mib * (1 << 20), 0
-        try:
-            self.db = self._open()
-        except sqlite3.OperationalError as e:
-            raise TemporaryError(f"{path}: {e}; name a file in a folder of your own") from e
-        except sqlite3.DatabaseError as e:
-            self.db = self._anew(e)
+        with ExitStack() as opened:
+            try:
+                if path:
+                    lock = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+                    opened.callback(os.close, lock)
+                    if not storage.locked(lock):
+                        raise BlockingIOError("another program writes there")
+                self.db = self._open()
+            except (OSError, sqlite3.OperationalError) as e:
+                why = getattr(e, "strerror", None) or e
+                raise TemporaryError(f"{path}: {why}; name a file in a folder of your own") from e
+            except sqlite3.DatabaseError as e:
+                self.db = self._anew(e)
+            self._opened = opened.pop_all()
 
     def close(self) -> None:
         """Close the file."""
         self.db.close()
+        self._opened.close()
 
     def add(self, at_s: float, verdict: Mapping[str, Any]) -> None:
         """Write a verdict. at_s: seconds since 1970. Raises sqlite3.Error, such as for a full

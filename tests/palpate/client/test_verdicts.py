@@ -216,6 +216,15 @@ def test_no_file(path, tmp_path):
         VerdictFile(tmp_path / "none" / "x.db")
 
 
+def test_a_second_writer_is_refused(path):
+    """It would write each verdict again; once the first has ended it may."""
+    first = VerdictFile(path)
+    with pytest.raises(TemporaryError, match="another program"):
+        VerdictFile(path)
+    first.close()
+    VerdictFile(path).close()
+
+
 class ScriptedFeed(Feed):
     """A feed of these lines."""
 
