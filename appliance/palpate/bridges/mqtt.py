@@ -27,7 +27,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from palpate.bridges.mqtt_broker import Broker
+from palpate.bridges.mqtt_broker import MOST_BYTES, BoundedClient, Broker
 from palpate.bridges.mqtt_content import discovery, state, verdict
 from palpate.bridges.results import Results
 from palpate.bridges.source import COMMANDS, source_of
@@ -51,12 +51,11 @@ LATE_NS = 1_000_000_000
 KEEPALIVE_S = 20
 """The broker sends the last will if it hears nothing for half as long again."""
 CONNECT_S = 5.0
-AGAIN_NS = 1_000_000_000
-"""Pause after a lost connection: two boxes of one name would take it from each other at once."""
+LASTS_NS = 60_000_000_000
+"""After a shorter connection the next one waits, longer each time, as if there were no broker: two
+boxes of one name take it from each other."""
 TICK_S = 0.5
 """Longest time between two looks at the state of the box and at the end of the program."""
-MOST_BYTES = 1024
-"""Largest packet that the broker may send: commands are short."""
 MOST_COMMANDS, PAUSE_NS = 50, 2_000_000_000
 """Commands in a second. After more the bridge asks the broker for no commands for this time: it
 would read them in place of the acknowledgements that verdicts wait for."""
@@ -127,11 +126,13 @@ class MqttBridge:
             self._wakes.send(b".")
 
     def session(self) -> None:
-        """One connection, from the first try to its loss or the end of the program."""
-        try:
-            client = retried(self._connect, self._clock, self._stopped, always=True)
-        except AddressError:  # the program ends
-            return
+        """Connections, until one has lasted or the program ends."""
+        with suppress(AddressError):  # the program ends
+            retried(self._connection, self._clock, self._stopped, always=True)
+
+    def _connection(self) -> None:
+        """One connection to its end. Raises AddressError if there is none, or it did not last."""
+        client, begin_ns = self._connect(), self._clock.now_ns()
         log.info(f"mqtt: connected to {self._broker}")
         self._next, self._said, self._deaf_ns = 0, {}, 0
         self._flying.clear()
@@ -144,13 +145,15 @@ class MqttBridge:
                 client.disconnect(WITH_WILL)
                 self._turn(client)
         except BROKEN as e:
-            self._refused = f"a packet that cannot be read ({type(e).__name__})"
+            self._refused = f"a packet that cannot be read ({e or type(e).__name__})"
         finally:
             _end(client)
         if not self._stopped():
-            why = f": {self._refused}" if self._refused else ""
-            log.warning(f"mqtt: {self._broker} has ended the connection{why}; connecting again")
-            self._clock.sleep_until(self._clock.now_ns() + AGAIN_NS)
+            other = f"without a reason; if again, another box may be named {self._name}: --name"
+            why = f"mqtt: {self._broker} has ended the connection: {self._refused or other}"
+            if self._clock.now_ns() - begin_ns < LASTS_NS:
+                raise AddressError(why)
+            log.warning(f"{why}; connecting again")
 
     def _connect(self) -> paho.Client:
         """A client that the broker has accepted. Raises AddressError."""
@@ -169,6 +172,7 @@ class MqttBridge:
                 if client.socket() is None:
                     self._refused = self._refused or "it has closed the connection"
         except BROKEN as e:
+            self._there = False  # also behind the packet that accepts
             self._refused = str(getattr(e, "strerror", None) or e).lower() or type(e).__name__
         if client and self._there:
             return client
@@ -179,9 +183,8 @@ class MqttBridge:
         )
 
     def _client(self) -> paho.Client:
-        client = paho.Client(
-            CallbackAPIVersion.VERSION2, f"palpate-{self._name}", protocol=paho.MQTTv5
-        )
+        name = f"palpate-{self._name}"
+        client = BoundedClient(CallbackAPIVersion.VERSION2, name, protocol=paho.MQTTv5)
         client.connect_timeout = CONNECT_S
         if self._broker.user:
             client.username_pw_set(self._broker.user, self._broker.password)

@@ -6,10 +6,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from paho.mqtt import client as paho
+from paho.mqtt.enums import MQTTErrorCode
+
 from palpate.bridges.options import read_login
 from palpate.core.errors import ConfigError
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
+MOST_BYTES = 1024
+"""Largest packet that the broker may send: commands are short."""
+
+
+class BoundedClient(paho.Client):
+    """Raises ValueError at a packet that is larger, or has another QoS than the bridge asks for:
+    the library would keep both without a bound."""
+
+    def _sock_recv(self, bufsize: int) -> bytes:
+        if bufsize > MOST_BYTES:
+            raise ValueError(f"a packet of {bufsize} bytes")
+        return super()._sock_recv(bufsize)
+
+    def _handle_publish(self) -> MQTTErrorCode:
+        if self._in_packet["command"] & 0b110:
+            raise ValueError("a message that asks for an acknowledgement")
+        return super()._handle_publish()
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from palpate.bridges.mqtt_broker import broker
 from palpate.bridges.source import COMMANDS
 from palpate.client.verdicts import VerdictFile
 from palpate.core import config, retry
@@ -25,6 +24,7 @@ from tests.factories.paths import NO_SITE
 from tests.factories.speaking_box import SpeakingBox, result, state
 
 mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
+broker = pytest.importorskip("palpate.bridges.mqtt_broker").broker
 pytestmark = pytest.mark.usefixtures("hurried")
 
 
@@ -41,7 +41,6 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pauses of hundredths of a second between two tries."""
     monkeypatch.setattr(retry, "FIRST_S", 0.02)
     monkeypatch.setattr(retry, "MOST_S", 0.05)
-    monkeypatch.setattr(mqtt, "AGAIN_NS", 50_000_000)
 
 
 def options(server: Mosquitto, box: SpeakingBox, *more: str) -> tuple[str, ...]:
@@ -144,7 +143,7 @@ def test_commands_only_where_they_are_allowed(server, box):
 @pytest.mark.slow
 def test_results_that_a_client_missed(server, box, tmp_path, monkeypatch):
     """Asked by time, also without --allow-writes, the bridge sends its results of this run; after a
-    restart of both it sends those of the file, too. A text that is no time is refused."""
+    restart of both it sends those of the file, too. Other texts are refused."""
     file = tmp_path / "verdicts.db"
     settings = config.load(None, [f"bridge.memory={file}"], site=NO_SITE)
     monkeypatch.setattr(config, "load", lambda board: settings)
@@ -289,6 +288,37 @@ def test_a_broker_that_takes_few_messages_at_a_time(box):
                     while more := line.recv(65536):
                         sent += more
     assert published(sent) == 2
+
+
+@pytest.mark.parametrize(
+    ("begin", "why"),
+    [
+        (b"\x30\xff\xff\xff\x7f", "a packet of 268435455 bytes"),
+        (b"\x34\x08\x00\x01t\x00\x01\x00hi", "asks for an acknowledgement"),
+    ],
+)
+def test_a_broker_that_would_fill_the_memory(box, caplog, begin, why):
+    """A message of 256 MiB, or one that waits for an acknowledgement, ends the connection."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        other.settimeout(LONG_S)
+        url = f"mqtt://127.0.0.1:{other.getsockname()[1]}"
+        with bridge("mqtt", "--port", str(box.path), "--broker", url):
+            line, _ = other.accept()
+            with line:
+                line.settimeout(LONG_S)
+                assert line.recv(4096)[0] == 0x10
+                line.sendall(bytes([0x20, 3, 0, 0, 0]) + begin)
+                eventually(lambda: why in caplog.text)
+                assert "Traceback" not in caplog.text
+
+
+@pytest.mark.slow
+def test_two_boxes_of_one_name(server, box, caplog, tmp_path):
+    """Each takes the connection of the other, with growing pauses, and the log names a cause."""
+    other = ("--feed", tmp_path / "none", "--broker", server.url, "--name", "b1")
+    with bridge("mqtt", *options(server, box)), bridge("mqtt", *other):
+        eventually(lambda: "another box may be named b1" in caplog.text)
+        assert "trying again" in caplog.text
 
 
 def published(sent: bytes) -> int:
