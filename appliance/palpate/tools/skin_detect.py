@@ -36,8 +36,9 @@ OpenPort = Callable[[str, int], BytePort]
 
 LINES = (
     "let it print equal lines of numbers, or describe them as matrix.toml explains: `start` or"
-    " `poll` for what it waits for, `prefix` or `index` for how its lines begin; lines of what has"
-    " changed cannot be described, so print all taxels"
+    " `poll` for what it waits for, `prefix` or `index` for how its lines begin, `lines` for rows,"
+    " which `palpate skin new` writes with --grid; lines of changes cannot be described, so print"
+    " all taxels"
 )
 """The remedy for text that is no lines of numbers."""
 

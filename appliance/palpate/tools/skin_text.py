@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ SHOWN = 60
 
 LEAST_COUNT = 99
 """A count that begins again goes at least so far."""
+LEAST_RISING = 0.75
+"""Share of steps upwards from which a number that begins again is that of a taxel."""
 LEAST_CYCLES = 3
 """A number that begins again so often counts the lines of a frame."""
 _FIRST = re.compile(rb"[^-+.0-9]*([0-9]{1,6})(?=[^0-9.])")
@@ -50,20 +53,22 @@ def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -
         return ""
     alike = [words if (len(words), text) == (width, around) else None for words, text in lines]
     # a text that comes after every few lines parts frames of as many rows
-    height = 1 if grid else _height(alike)
-    if height > 1 and often / height / seconds >= LEAST_HZ:
-        return ""
+    height = _height(alike)
+    parts = height > 1 and often / height / seconds >= LEAST_HZ
+    if parts and grid is None:
+        return ""  # or a text between frames
     skipped = _rising(np.array([[as_float(word) for word in words] for words in alike if words]))
     if width == len(skipped):
         return ""  # a count alone
     rows, cols = grid or _grid(width - len(skipped))
-    if rows * cols != width - len(skipped):
+    of_rows = parts and (rows, cols) == (height, width - len(skipped))
+    if not of_rows and rows * cols != width - len(skipped):
         return ""
     keys: dict[str, Any] = {
         "about": f"{rows} x {cols} taxels",
         "source": "lines that the skin sent",
         "codec": "text",
-        "lines": "frames",
+        "lines": "rows" if of_rows else "frames",
         "skip_columns": skipped,
         "around": around,
         "decimal": decimal,
@@ -71,19 +76,23 @@ def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -
         "number": "float32",
         "rows": rows,
         "cols": cols,
-        "rate_hz": round(often / seconds, 1),
+        "rate_hz": round(often / (rows if of_rows else 1) / seconds, 1),
     }
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in keys.items())
 
 
 def _counted(lines: list[bytes]) -> bool:
-    """Whether each line holds a row or a taxel with its number, so that `index` describes them."""
-    numbers = np.array([int(match[1]) for line in lines if (match := _FIRST.match(line))])
-    steps = np.diff(numbers)
+    """Whether each line holds a row or a taxel with its number, so that `index` describes them, or
+    a taxel that has changed. Taxels that change by little and at any time are no number."""
+    found = [int(match[1]) for line in lines if (match := _FIRST.match(line))]
+    runs = [(number, len(list(run))) for number, run in groupby(found)][1:-1]
+    steps = np.diff([number for number, _ in runs])
     if np.count_nonzero(steps < 0) < LEAST_CYCLES:
         return False
-    rises = (steps == 0) | (steps == 1) | (numbers[1:] == numbers.min())
-    return bool(numbers.min() <= 1 and rises.mean() >= LEAST_SHARE)
+    least, often = min(runs)[0], Counter(length for _, length in runs).most_common(1)[0][1]
+    begins = np.array([number == least for number, _ in runs[1:]])
+    cycles = ((steps == 1) | begins).mean() >= LEAST_SHARE or (steps > 0).mean() >= LEAST_RISING
+    return bool(least <= 1 and often >= LEAST_SHARE * len(runs) and cycles)
 
 
 def is_text(data: bytes) -> bool:
@@ -121,11 +130,10 @@ def odd_line(data: bytes) -> str:
 
 
 def _height(alike: list[list[bytes] | None]) -> int:
-    """Lines of a frame: the usual distance of the lines that part frames; 1 if there are none."""
-    parting = [i for i, words in enumerate(alike) if words is None]
-    steps = Counter(np.diff(parting).tolist())
-    step, often = steps.most_common(1)[0] if steps else (0, 0)
-    return step - 1 if step > 2 and often * step >= LEAST_SHARE * len(alike) else 1
+    """Lines of a frame: the usual number of lines between others; 1 if there are none."""
+    runs = Counter(len(list(run)) for whole, run in groupby(alike, bool) if whole)
+    height, often = runs.most_common(1)[0]
+    return height if often * height >= LEAST_SHARE * sum(map(bool, alike)) and often > 1 else 1
 
 
 def _rising(table: NDArray[np.float64]) -> list[int]:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -140,15 +141,26 @@ def numbers(i: int, wide: int = 16) -> bytes:
     return (",".join(str(100 + (i * i + k) % 97) for k in range(wide)) + "\n").encode()
 
 
+def rows(i: int) -> bytes:
+    """Four lines of six numbers."""
+    return b"".join(numbers(i + k, 6) for k in range(4))
+
+
 @pytest.mark.parametrize(
-    ("sent", "grid", "rows"),
+    ("sent", "grid", "taxels"),
     [
         (numbers, None, "4 x 4"),
         (lambda i: LOG % i * (i % 50 == 3) + numbers(i), None, "4 x 4"),
         (lambda i: LOG % i * (i % 50 == 3) + numbers(i), (4, 4), "4 x 4"),
         (lambda i: LOG % i * (i % 4 == 3) + numbers(i), (2, 8), "2 x 8"),
         (lambda i: b"Frame %d\n" % i + b"".join(numbers(i + k) for k in range(8)), None, ""),
-        (lambda i: b"\n" + b"".join(numbers(i + k) for k in range(4)), (4, 16), ""),
+        (lambda i: b"\n" + b"".join(numbers(i + k) for k in range(4)), (4, 16), "4 x 16"),
+        (lambda i: b"Frame %d\n" % i + rows(i), (4, 6), "4 x 6"),
+        (lambda i: b"<start>\n" + rows(i) + b"<end>\n", (4, 6), "4 x 6"),
+        (lambda i: b"<start>\n" + rows(i) + b"<end>\n", (6, 4), ""),
+        (lambda i: b"<start>\n" + rows(i) + b"<end>\n", None, ""),
+        (lambda i: b"%d," % (i * i % 7 < 2) + numbers(i, 15), (4, 4), "4 x 4"),
+        (lambda i: b"".join(b"%d,%d\n" % (k, i) for k in range(i % 3, 16, 3)), None, ""),
         (lambda i: numbers(i).replace(b"\n", b";\n"), None, "4 x 4"),
         (lambda i: b"\x1b[0;32mI (%d) s: " % i + numbers(i)[:-1] + b"\x1b[0m\n", None, "4 x 4"),
         (lambda i: b"%d\n" % i, None, ""),
@@ -156,13 +168,17 @@ def numbers(i: int, wide: int = 16) -> bytes:
         (lambda i: bytes([200, i % 256]) * 20, None, ""),
     ],
 )
-def test_lines_of_numbers_are_described(sent, grid, rows):
-    """Log lines between frames are passed over; frames of several lines are for a person."""
+def test_lines_of_numbers_are_described(sent, grid, taxels):
+    """Log lines between frames are passed over; frames of several lines need their grid.
+    Numbers of taxels and taxels that flicker are told apart."""
     clock = VirtualClock()
     port = WirePort(clock, sent, 1e7)
-    text, _ = skin_detect.Ports(port.open, clock).propose("/dev/a", {}, grid)
-    assert text.startswith(f'about = "{rows} taxels' if rows else "")
-    assert bool(text) == bool(rows)
+    text, heard = skin_detect.Ports(port.open, clock).propose("/dev/a", {}, grid)
+    assert text.startswith(f'about = "{taxels} taxels' if taxels else "")
+    assert bool(text) == bool(taxels)
+    if text:
+        profile = skin_profile.from_json(tomllib.loads(text), "proposed")
+        assert skin_detect.measured_hz(profile, heard) == pytest.approx(profile.rate_hz, rel=0.02)
 
 
 @pytest.mark.parametrize(
