@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.answer.early import Early
+from palpate.answer.objects import softmax
+from palpate.answer.unknown import UNSURE
 from palpate_train.answer.calibrate import Calibration, fit_calibration
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.fit_early import EarlyRule
@@ -56,6 +58,20 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
         sturdy.weight * sturdy.temperature, plain.weight * plain.temperature
     )
     assert (sturdy.held["recording"].numbers < known.sum()).all()
+
+
+@pytest.mark.parametrize("beside", [True, False], ids=["place", "recordings"])
+def test_a_condition_that_nothing_carries_over_does_not_make_all_answers_unsure(beside: bool):
+    """38 materials that are in other features in each session: what is right elsewhere is sure."""
+    rng, labels = np.random.default_rng(4), np.tile(np.arange(38), 18)
+    session, place = np.repeat(np.arange(3), 6 * 38), np.repeat(np.arange(18), 38) % 6
+    x = 12 * np.eye(114)[38 * session + labels] + rng.standard_normal((len(labels), 114))
+    given = plain_inputs(np.repeat(x[:, None], 4, axis=1), labels, session, place < 6)
+    hard = {"session": session} | ({"place": place} if beside else {})
+    made = fit_calibration(replace(given, conditions=hard, recordings=place))
+    assert np.mean(made.held["session"].probabilities.argmax(axis=1) == labels) < UNSURE
+    sure = softmax(made.logits(x)).max(axis=1) >= UNSURE
+    assert sure.mean() > 0.95
 
 
 @pytest.mark.slow

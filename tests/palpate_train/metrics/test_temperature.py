@@ -40,6 +40,21 @@ def test_evidence_is_needed_to_cool_a_head():
     )
 
 
+@pytest.mark.parametrize("classes", [3, 38])
+def test_a_head_that_is_less_sure_than_right_is_warmed(classes: int):
+    """Logits too small by three; and gross errors, which cost more the more materials there are."""
+    rng, labels = np.random.default_rng(1), np.arange(380) % classes
+    logits = 3 * np.eye(classes)[labels] + rng.standard_normal((380, classes))
+    right = np.mean(logits.argmax(axis=1) == labels)
+    found = sufficient_temperature(logits / 3, labels, labels)
+    assert found < 0.5
+    assert softmax(logits / 3 / found).max(axis=1).mean() == pytest.approx(right, abs=0.05)
+    logits[::4] = 30 * np.eye(classes)[(labels[::4] + 1) % classes]
+    right = np.mean(logits.argmax(axis=1) == labels)
+    found = sufficient_temperature(logits, labels, np.arange(380) // 4)
+    assert softmax(logits / found).max(axis=1).mean() > right - 0.05
+
+
 def test_one_wrong_sweep_or_group_asks_for_little():
     """One of 300 wrong by 1: about half; evidence of one group of thirty does not count."""
     labels = np.arange(300) % 3

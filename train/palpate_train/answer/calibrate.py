@@ -188,7 +188,7 @@ class CalibrationInputs:
 
     prefixes: [N, D + 1, F], features of the first tenth of the window, the first two tenths, and so
     on to the whole window. labels: [N], 0 to K - 1. conditions: int [N] by name, the hardest first;
-    a sweep is judged without its value of each, and the hardest decides temperatures and rules.
+    a sweep is judged without its value of each; see `_deciding` for temperatures and rules.
     held: bool [N], the sweeps of some values of the hardest, which trained stages did not see.
     staged: whether there are such stages; if not, all sweeps judge. fixed: number of features, the
     last ones, that were not trained (see `embed`). If there are any, most of a distance lies
@@ -197,7 +197,8 @@ class CalibrationInputs:
     them, the heads do not. junk: features [m, F] of windows of each kind of junk, where sweeps are
     too few to show where other things lie. plan: of the head that names the material; None for one
     discriminant of all features. weights: [N], how much each sweep counts for that head; None if
-    all count alike, as they do for the embedding.
+    all count alike, as they do for the embedding. recordings: int [N], those of a material without
+    a gap in their numbers; None if they are unknown.
     """
 
     prefixes: Array
@@ -210,6 +211,7 @@ class CalibrationInputs:
     faulty: Array
     plan: HeadPlan | None = None
     weights: Array | None = None
+    recordings: Array | None = None
     junk: Mapping[str, Array] = field(default_factory=dict)
 
     @property
@@ -269,8 +271,9 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     is only one group or no sweep to judge by."""
     whole, labels = given.whole, given.labels
     named = {name: _named(given, values) for name, values in given.conditions.items()}
-    logits, numbers, class_mean_temperature = _prefix_logits(given, *next(iter(named.values())))
-    groups = given.groups[numbers]
+    values, *judged = _deciding(given, named)
+    logits, numbers, class_mean_temperature = _prefix_logits(given, values, *judged)
+    groups = values[numbers]
     temperatures = fit_early.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
     embedding = in_two_views(whole, labels, given.fixed, given.beyond)
@@ -358,13 +361,28 @@ def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
     return np.concatenate(numbers), np.concatenate(logits)
 
 
+def _deciding(
+    given: CalibrationInputs, named: Mapping[str, tuple[Array, Array]]
+) -> tuple[Array, Array, Array]:
+    """The values [N] of the condition that decides temperatures and rules, and what `_named` gives
+    of it. It is the hardest condition under which the labels of at least the share UNSURE are
+    right; recordings, if there is none. Where most labels are wrong no answer would be sure, not
+    even under values that training has.
+    """
+    for name, (judging, logits) in named.items():
+        if np.mean(logits.argmax(axis=1) == given.labels[judging]) >= UNSURE:
+            return given.conditions[name], judging, logits
+    values = given.groups if given.recordings is None else given.recordings
+    return values, *_named(given, values)
+
+
 def _prefix_logits(
-    given: CalibrationInputs, judging: Array, named: Array
+    given: CalibrationInputs, groups: Array, judging: Array, named: Array
 ) -> tuple[Array, Array, float]:
     """Logits [n, D + 1, K] of the judged sweeps and their prefixes by heads that did not see their
-    value of the hardest condition, at temperature 1; the numbers [n] of these sweeps; the
+    value of a condition `groups` [N], at temperature 1; the numbers [n] of these sweeps; the
     temperature of logits from class means. judging, named: of `_named` for this condition."""
-    labels, groups = given.labels, given.groups
+    labels = given.labels
     parts = given.cross_fitted(groups, given.judged)
     logits, numbers = fit_early.cross_fitted_logits(given.prefixes, labels, parts)
     temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])

@@ -106,7 +106,8 @@ def fit(
     across, judge = turn(~held)
     novelty = judge.novelty(across(judging.features))
     beyond = limit(novelty, kept)
-    temperature = sufficient_temperature(logits, judging.labels, groups[judging.source])
+    # a displaced sweep is never surer than one in place
+    temperature = max(sufficient_temperature(logits, judging.labels, groups[judging.source]), 1.0)
     p = softmax(logits / temperature)
     wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)
     enough = [

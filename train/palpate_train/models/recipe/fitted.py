@@ -311,9 +311,11 @@ def calibration_inputs(fit: Fit, known: HeadData | None = None) -> CalibrationIn
         name: np.unique(np.concatenate([s.group(name) for s in of_all]), return_inverse=True)[1]
         for name in (by, *fit.about["conditions"])
     }
+    labels = np.concatenate([s.labels for s in of_all])
+    recordings = np.concatenate([s.group("recording") for s in of_all])
     return CalibrationInputs(
         run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
-        np.concatenate([s.labels for s in of_all]),
+        labels,
         conditions,
         role == 1,
         bool(fit.architecture.channels),
@@ -322,6 +324,7 @@ def calibration_inputs(fit: Fit, known: HeadData | None = None) -> CalibrationIn
         role == 2,
         fit.plan,
         np.concatenate([s.groups[WEIGHT] for s in of_all]) if WEIGHT in train.groups else None,
+        np.unique(np.stack([labels, recordings]), axis=1, return_inverse=True)[1].ravel(),
         _junk(fit),
     )
 
