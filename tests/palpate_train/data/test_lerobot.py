@@ -75,7 +75,7 @@ def of_windows(folder: Path, rows: np.ndarray, name: str = "tactile") -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["tactile", "tactile_window", "skin.history"])
+@pytest.mark.parametrize("name", ["tactile", "tactile_window", "skin.history", "touch.times"])
 def test_a_row_can_hold_several_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ):
@@ -86,6 +86,8 @@ def test_a_row_can_hold_several_frames(
     out = capsys.readouterr()
     assert "[5, 4]" in (out.err if asked else out.out)
     assert asked == (name != "tactile")
+    assert imported(folder.parent, *MATERIAL) == 65
+    assert f"{folder} in it is a LeRobot data set" in capsys.readouterr().err
     assert imported(folder, *MATERIAL, "--grid", "2x2") == 0
     made = sets.load(str(tmp_path / "s.npz"))
     assert (made.format.rate_hz, made.samples.shape) == (150, (4, 20, 2, 2))

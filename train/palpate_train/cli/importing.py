@@ -123,6 +123,10 @@ def _plan(args: argparse.Namespace) -> ImportPlan:
     in_variable = [name for name, _ in FIELD.findall(args.variable)]
     rate, table = args.rate, label_table.read(args.labels) if args.labels else {}
     labelled = next(iter(table.values()), {})
+    if not args.pattern and (inner := next(args.folder.glob(f"*/{lerobot.INFO}"), None)):
+        raise FormatError(
+            f"{args.folder}: {inner.parents[1]} in it is a LeRobot data set; name its folder"
+        )
     if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
         rate = lerobot.rate_hz(args.folder, args.variable, "" if args.columns else args.grid)
     return ImportPlan(

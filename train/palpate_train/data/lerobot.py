@@ -30,7 +30,7 @@ EPISODE, FRAME, TASK, TASK_INDEX, TIME = (
 )  # fmt: skip
 TACTILE = ("tactile", "touch", "taxel", "skin")
 """What the names of tactile features contain. LeRobot prescribes no name."""
-SEVERAL = ("window", "history", "buffer", "stack", "sequence", "frames", "steps")
+SEVERAL = ("time", "window", "history", "buffer", "stack", "sequence", "frames", "steps")
 """What the names of features and axes contain if a row holds several frames."""
 PICTURES = ("video", "image", "string")
 MOST = 1_000_000

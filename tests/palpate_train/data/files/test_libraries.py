@@ -258,8 +258,8 @@ def test_a_topic_of_texts_gives_labels(tmp_path: Path, kind: str, late: int):
     path = bag(name, kind, "std_msgs/msg/Float32MultiArray", texts)
     if kind != "bag":
         (path,) = path.glob(f"*.{kind}")
-    found = raw_files.read(path, ReadPlan(fields=("/note",)))
-    assert found.labels["/note"] == LABELS[late:]
+    found = raw_files.read(path, ReadPlan(fields=("/note", "note")))
+    assert found.labels["/note"] == found.labels["note"] == LABELS[late:]
     np.testing.assert_array_equal(found.values, SKIN[late:])
     np.testing.assert_allclose(found.vectors["received"], TIMES[late:])
     assert len(found.notes) == (late > 0)

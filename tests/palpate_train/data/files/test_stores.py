@@ -92,21 +92,23 @@ def messages(path: Path, end: bool = True) -> Path:
 def test_messages_of_json(tmp_path: Path):
     """Frames with the times of their recording, from the first label on; topics are listed."""
     path = messages(tmp_path / "a.mcap")
-    found = raw_files.read(path, ReadPlan(fields=("/label",)))
+    found = raw_files.read(path, ReadPlan(fields=("/label", "label")))
     np.testing.assert_array_equal(found.values, SKIN[2:])
     np.testing.assert_allclose(found.vectors["received"], TIMES[2:], atol=1e-9)
-    assert found.labels["/label"] == ["felt"] * 38
+    assert found.labels["/label"] == found.labels["label"] == ["felt"] * 38
     with pytest.raises(FormatError, match="/skin"):
         raw_files.read(path, ReadPlan("/other"))
     with pytest.raises(FormatError, match="recover"):
         raw_files.read(messages(tmp_path / "b.mcap", end=False))
-    with (tmp_path / "c.mcap").open("wb") as file:
-        writer = mcap.writer.Writer(file)
-        writer.start()
-        writer.add_message(writer.register_channel("/skin", "protobuf", 0), 0, b"\0", 0)
-        writer.finish()
-    with pytest.raises(FormatError, match=r"/skin \(protobuf\)"):
-        raw_files.read(tmp_path / "c.mcap")
+    for profile, said in (("", r"/skin \(protobuf\)"), ("ros2", "in 'protobuf'")):
+        with (tmp_path / "c.mcap").open("wb") as file:
+            writer = mcap.writer.Writer(file)
+            writer.start(profile)
+            schema = writer.register_schema("skin.Frame", "protobuf", b"")
+            writer.add_message(writer.register_channel("/skin", "protobuf", schema), 0, b"\0", 0)
+            writer.finish()
+        with pytest.raises(FormatError, match=said):
+            raw_files.read(tmp_path / "c.mcap")
 
 
 @pytest.mark.slow

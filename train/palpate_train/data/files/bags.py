@@ -68,7 +68,7 @@ def read(path: Path, wanted: ReadPlan) -> Table:
             topics.setdefault(normal(connection.topic), []).append(connection)
         types = {name: connections[0].msgtype for name, connections in topics.items()}
         name = only("topic", types, wanted.variable, lambda n: _fits(bag, topics[n]))
-        labels = {name: topics[name] for name in wanted.fields if name in topics}
+        labels = {n: topics[at] for n in wanted.fields for at in (n, f"/{n}") if at in topics}
         return _table(bag, topics[name], labels)
 
 
@@ -79,6 +79,10 @@ def _opened(highlevel: Any, source: Path, store: Any, mends: str) -> Iterator[An
         try:
             reader = highlevel.AnyReader([source], default_typestore=store)
             bag = stack.enter_context(reader)
+        except KeyError as e:
+            raise FormatError(
+                f"holds messages in {e}, though it says that it is of ROS 2; record JSON or ROS 2"
+            ) from e
         except Exception as e:  # its readers raise errors of several types for damaged files
             if not mends:
                 raise

@@ -54,7 +54,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         vectors={TIME: 1e-9 * (np.array(at_ns) - at_ns[0])},
         beside=(TIME,),
     )
-    said = {n: _texts(n, topics[n]) for n in wanted.fields if n in topics}
+    asked = {n: at for n in wanted.fields for at in (n, f"/{n}") if at in topics}
+    said = {n: _texts(at, topics[at]) for n, at in asked.items()}
     return labelled(table, at_ns, said)
 
 
