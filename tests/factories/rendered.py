@@ -6,9 +6,17 @@ from typing import Any
 
 import pytest
 
-WIDTHS = (390, pytest.param(1024, marks=pytest.mark.thorough), 1920)
-"""Of a phone, a tablet and a desktop. A page that is legible on the others is so on a tablet."""
 SCHEMES = ("light", "dark")
+LOOKS = pytest.mark.parametrize(
+    ("width", "scheme"),
+    [
+        pytest.param(width, scheme, marks=[pytest.mark.thorough] * (scheme != usual))
+        for width, usual in ((390, "light"), (1024, ""), (1920, "dark"))
+        for scheme in SCHEMES
+    ],
+)
+"""Widths of a phone, a tablet and a desktop with colour schemes. Colours depend on the scheme alone
+and places on the width alone, and what is legible on the others is so on a tablet."""
 TALLEST = 16000
 """Height of the window. It has to hold the whole page, because colours are read by position."""
 FAULTS = """() => {

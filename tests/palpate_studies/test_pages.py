@@ -141,8 +141,7 @@ def readable(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", rendered.SCHEMES)
-@pytest.mark.parametrize("width", rendered.WIDTHS)
+@rendered.LOOKS
 @pytest.mark.parametrize("page", [*HTML, "development", "stress"])
 def test_a_page_can_be_read(
     browser: Any, readable: dict[str, Path], page: str, width: int, scheme: str

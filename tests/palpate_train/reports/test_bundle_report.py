@@ -256,8 +256,7 @@ def test_each_condition_has_its_curve(figures: dict):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", rendered.SCHEMES)
-@pytest.mark.parametrize("width", rendered.WIDTHS)
+@rendered.LOOKS
 def test_the_page_can_be_read_everywhere(
     browser: Any, tmp_path: Path, figures: dict, sweeps: Dataset, width: int, scheme: str
 ):

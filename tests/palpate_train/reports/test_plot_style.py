@@ -79,3 +79,25 @@ def test_texts_of_every_role_can_be_read(roles: dict[str, str]):
     rgb = {role: [int(colour[i : i + 2], 16) for i in (1, 3, 5)] for role, colour in roles.items()}
     for role in ("text", "grey", "accent"):
         assert contrast(rgb[role], rgb["background"]) >= 4.5, role
+
+
+@pytest.mark.parametrize(
+    ("ticks", "labels"),
+    [
+        ((0.9, 0.925, 0.95, 0.975, 1.0), ["90", "92.5", "95", "97.5", "100 %"]),
+        ((0.0, 1 / 3, 0.7000000001), ["0", "33.3333", "70 %"]),
+        ((-0.5, 0.987), ["−50", "98.7 %"]),
+    ],
+)
+def test_ticks_have_as_many_decimals_as_they_need(ticks: tuple[float, ...], labels: list[str]):
+    """No label is rounded to the places of another; matplotlib's, which may be, are refused."""
+    figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)
+    axes.set_xlim(-1, 1)
+    with pytest.raises(TypeError, match="set_ticks"):
+        plot_style.to_svg(figure, "ticks")
+    plot_style.set_ticks(axes.xaxis, ticks, percent=True)
+    plot_style.set_ticks(axes.yaxis, [1e-5, 12_500], "ms")
+    plot_style.to_svg(figure, "ticks")
+    assert [label.get_text() for label in axes.get_xticklabels()] == labels
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0.00001", "12500 ms"]
+    assert list(axes.get_xticks()) == list(ticks)

@@ -113,8 +113,7 @@ def test_arrow_keys_turn_the_page(browser: Any, address: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", rendered.SCHEMES)
-@pytest.mark.parametrize("width", rendered.WIDTHS)
+@rendered.LOOKS
 def test_the_page_can_be_read_everywhere(browser: Any, address: str, width: int, scheme: str):
     """The page can be read at three widths, by day and by night."""
     assert rendered.faults(browser, address, width, scheme) == {}

@@ -200,7 +200,8 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
     """The picture as SVG text. about: its title, for readers who cannot see it. plain: use fixed
     colours instead of roles, for a picture outside of a page.
 
-    Each axis with numbers has its title as the attribute data-axis, "" if it has none.
+    Each axis with numbers has its title as the attribute data-axis, "" if it has none. Raises
+    TypeError for an axis with labels that neither set_ticks nor set_categories has made.
     """
     figure.patch.set_facecolor(WHITE)
     for axes in figure.axes:
@@ -224,9 +225,12 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
 def _named(axis: Axis, shared: str) -> str | None:
     """The id under which an axis with numbers is drawn: its title, or the title shared by the
     picture."""
-    if not isinstance(axis.get_major_formatter(), TickFormatter) or not len(
-        axis.get_majorticklocs()
-    ):
+    made = axis.get_major_formatter()
+    if not axis.axes.axison or not len(axis.get_majorticklocs()):
+        return None
+    if not isinstance(made, (TickFormatter, FixedFormatter, NullFormatter)):
+        raise TypeError("labels of matplotlib may be rounded; call set_ticks or set_categories")
+    if not isinstance(made, TickFormatter):
         return None
     return AXIS + (axis.get_label_text() or shared)
 
