@@ -37,11 +37,10 @@ from palpate.core.clock import SystemClock
 from palpate.core.provenance import commit
 from palpate.runtime import assembly
 from palpate.sim import devices, script
-from tests.factories import ros
 from tests.factories.bridges import bridge
-from tests.factories.brokers import Mosquitto, Subscriber
 from tests.factories.paths import NO_SITE, ROOT
-from tests.robots import page
+from tests.robots import page, ros
+from tests.robots.brokers import Mosquitto, Subscriber
 
 RESULTS = ROOT / "docs" / "data" / "robots-latency.json"
 POLL_S = 0.01

@@ -19,9 +19,9 @@ from palpate.core import config, retry
 from palpate.core.errors import ConfigError
 from palpate.service.network import box_name
 from tests.factories.bridges import LONG_S, bridge, eventually
-from tests.factories.brokers import Mosquitto, Subscriber, TopicFlood, free_port, required
 from tests.factories.paths import NO_SITE
 from tests.factories.speaking_box import SpeakingBox, result, state
+from tests.robots.brokers import Mosquitto, Subscriber, TopicFlood, free_port, required
 
 mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
 broker = pytest.importorskip("palpate.bridges.mqtt_broker").broker

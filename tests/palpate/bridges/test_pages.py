@@ -19,10 +19,10 @@ from palpate.client.box import Palpate
 from palpate.core.errors import NoAnswer
 from palpate.core.sentences import Sentence
 from palpate.core.status import Status
-from tests.factories import ros
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
+from tests.robots import ros
 
 pytestmark = pytest.mark.usefixtures("hurried")
 
@@ -200,7 +200,7 @@ def test_ros(box, program, settings):
     box.script = answering("unsure", "ok", "unknown", "stuck-taxel", "unsure", "unsure", "unsure")
     command = [
         str(ros.PYTHON),
-        str(ROOT / "tests" / "factories" / "ros_page.py"),
+        str(ROOT / "tests" / "robots" / "ros_page.py"),
         program,
         json.dumps(settings),
     ]

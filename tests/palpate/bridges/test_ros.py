@@ -15,11 +15,11 @@ import pytest
 
 from palpate.cli.main import main
 from palpate.core.sentences import sentence
-from tests.factories import ros, ros_launch
 from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
-from tests.factories.ros import RosPeer
 from tests.factories.speaking_box import SpeakingBox, finger, result, state
+from tests.robots import ros, ros_launch
+from tests.robots.ros import RosPeer
 
 OK, WARN, ERROR, STALE = range(4)
 PARAMETERS = ROOT / "docs" / "robots" / "palpate.yaml"

@@ -11,10 +11,10 @@ import pytest
 
 from palpate.core.sentences import Sentence
 from palpate.core.status import Status
-from tests.factories import ros
 from tests.factories.bridges import LONG_S, bridge, eventually
-from tests.factories.ros import RosPeer
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
+from tests.robots import ros
+from tests.robots.ros import RosPeer
 
 WRITES = ("-p", "allow_writes:=true")
 LONG = {"slide_s": LONG_S, "timeout_s": 2 * LONG_S}

@@ -87,7 +87,7 @@ class RosPeer:
 @contextmanager
 def peer() -> Iterator[RosPeer]:
     """Run the second node."""
-    script = ROOT / "tests" / "factories" / "ros_peer.py"
+    script = ROOT / "tests" / "robots" / "ros_peer.py"
     command = [PYTHON, str(script)]
     pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
     pipes["stderr"] = subprocess.DEVNULL
