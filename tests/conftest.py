@@ -98,7 +98,7 @@ def launched() -> Iterator[Any]:
 
 @pytest.fixture
 def browser(launched: Any) -> Iterator[Any]:
-    """The browser; what a test opens in it is closed."""
+    """The browser; pages of a test are closed at its end."""
     yield launched
     for context in launched.contexts:
         context.close()

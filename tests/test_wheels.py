@@ -77,7 +77,7 @@ def run(wheels: list[Path], program: str, folder: Path) -> str:
 
 @pytest.mark.slow
 def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
-    """Each holds one package, whose name nobody else has; the box's has its bundle and licence."""
+    """Each holds one package, whose name nobody else has, with its data files."""
     tops = {
         name: {entry.partition("/")[0] for entry in zipfile.ZipFile(path).namelist()}
         for name, path in wheels.items()
@@ -91,15 +91,13 @@ def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
     held = ("default_bundle/model.onnx", "default_bundle/manifest.json", "web/page/watch.html")
     assert {f"palpate/{name}" for name in held} <= set(names)
     assert any(n.endswith("licenses/LICENSE") for n in names)
-
-
-@pytest.mark.slow
-def test_the_desktop_holds_its_templates(wheels: dict[str, Path]):
-    """Pages of reports are made of files that are not modules."""
     folder = ROOT / "train" / "palpate_train" / "reports" / "templates"
-    wanted = {f"palpate_train/reports/templates/{path.name}" for path in folder.iterdir()}
-    assert wanted
-    assert wanted <= set(zipfile.ZipFile(wheels["palpate_train"]).namelist())
+    templates = {f"palpate_train/reports/templates/{path.name}" for path in folder.iterdir()}
+    assert (
+        0
+        < len(templates & {*zipfile.ZipFile(wheels["palpate_train"]).namelist()})
+        == len(templates)
+    )
 
 
 @pytest.mark.slow

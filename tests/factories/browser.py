@@ -72,6 +72,12 @@ Counts on taxels are left out, because their colours change.
 """
 
 
+UNNAMED = """() => [...document.querySelectorAll(
+    "section, canvas, meter, button, a, input, table, [role]")]
+  .filter((e) => !(e.textContent.trim() || e.labels?.length
+    || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby"))).map((e) => e.id)"""
+
+
 class BrowsedPage:
     """A page in a context of its own. size: width and height. prepare: called with the context
     before the page is opened. errors: the browser's messages. requests: the requested addresses."""
@@ -101,6 +107,11 @@ class BrowsedPage:
     def text(self, where: str) -> str:
         """The text of an element, without non-breaking spaces."""
         return str(self.page.inner_text(where)).replace("\xa0", " ")
+
+    def unnamed(self) -> list[str]:
+        """The ids of parts without a name for a screen reader."""
+        found: list[str] = self.page.evaluate(UNNAMED)
+        return found
 
     def legibility(self) -> tuple[int, list[tuple[str, float]]]:
         """The number of texts, and the texts with a contrast below 4.5 (WCAG 2.1, 1.4.3)."""

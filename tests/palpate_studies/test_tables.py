@@ -105,24 +105,6 @@ def test_answers_add_up_and_older_figures_say_so_first():
     assert "0badbead" in bench_table.table(figures | {"bundle": "0badbead"}).partition("\n")[0]
 
 
-@pytest.mark.parametrize(
-    "row",
-    [
-        r"simulated.*n = \d+.* \| \d+ of \d+: \d+\.\d % \[",
-        r"last frame.* \| median [\d.]+ ms, 99 % within [\d.]+ ms \(n = 60\)",
-        r"packaged bundle \(int8\) \| median [\d.]+ ms",
-        r"paper's network.* \| median [\d.]+ ms",
-        r"resident memory.* \| [\d.]+ MiB; [+-][\d.]+ MiB",
-        r"one core.* \| [\d.]+ %",
-        r"READY.* \| median [\d.]+ s, longest [\d.]+ s",
-        r"size of the packaged bundle.* \| [\d.]+ kB, of it the network [\d.]+ kB",
-    ],
-)
-def test_the_bench_has_a_row_for_each_figure(row: str):
-    """Figures are in percent or have units."""
-    assert re.search(row, bench_table.table(committed("bench")))
-
-
 def result(method: str, protocol: str, right: int, removed: bool = True, **more: Any) -> Any:
     """A result as evaluate writes it, of a hundred windows and two materials."""
     ends = [right / 100 - 0.02, right / 100 + 0.02]

@@ -482,16 +482,6 @@ def test_help_and_status_load_little(words):
     assert python(code) == "set()"
 
 
-def test_settings_have_their_sources(capsys):
-    """Each value with the file it comes from."""
-    sets = with_sets("sweep.max_duration_s=9")
-    assert main(["check", "--settings", "--board", "rpi5", *sets]) == 0
-    out = capsys.readouterr().out
-    (line,) = [line for line in out.splitlines() if line.startswith("sweep.max_duration_s")]
-    assert line.endswith("# --set")
-    assert "board-rpi5.toml" in out
-
-
 def test_status_finds_another_runtime_folder(tmp_path, monkeypatch, capsys):
     """A settings file that names store.runtime is read, and a missing one is not needed."""
     monkeypatch.setattr(runtime_folder, "CHECKOUT", str(tmp_path))

@@ -211,17 +211,6 @@ def test_usb_ids_and_serial_number(folder, usb, ids):
     assert (skin.vendor_id, skin.product_id, skin.serial) == ids
 
 
-@pytest.mark.parametrize(
-    "section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")]
-)
-def test_each_field_is_explained(section):
-    """The name of each setting stands in the docstring of its group."""
-    group = type(getattr(_shipped(), section))
-    assert [
-        name for name in schema.keys(group) if not re.search(rf"\b{name}\b", group.__doc__)
-    ] == []
-
-
 def test_the_shipped_skin_toml_is_complete_and_names_no_board(folder):
     """It changes nothing; `board` there would be read too late."""
     table = tomllib.loads((FIRMWARE / "skin.toml").read_text())

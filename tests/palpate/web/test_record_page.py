@@ -280,13 +280,7 @@ def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
 def test_everything_on_it_has_a_role_and_a_name(browser, recorded):
     """Sections, fields, pictures and buttons have names for screen readers, which speak changes."""
     seen = opened(browser, recorded)
-    unnamed = seen.page.evaluate(
-        """() => [...document.querySelectorAll("section, canvas, button, input, table, [role]")]
-        .filter((e) => !(e.textContent.trim() || e.labels?.length
-          || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
-        .map((e) => e.id)"""
-    )
-    assert set(unnamed) <= {"banner", "said"}
+    assert set(seen.unnamed()) <= {"banner", "said"}
     assert seen.page.get_attribute("#said", "role") == "status"
     assert seen.page.get_attribute("#now", "aria-live") == "polite"
     assert json.dumps(seen.requests).count(".js") == 7

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.answer.objects import softmax
 from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
 from palpate_studies import cost
-from palpate_train.models import methods
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.quantize import quantize
 from tests.factories.later import Later
@@ -40,21 +38,6 @@ def test_its_weights_and_work_are_those_of_depthwise_separable_layers():
     # beside the layers: sums and means of the taxels
     layers = steps * (64 * 40 + 4 * 64 * (9 + 64)) + 64 * 3
     assert 0 <= cost.macs(graph) - layers <= 4 * 128 * 2
-
-
-@pytest.mark.slow
-@pytest.mark.thorough  # trains for seconds
-def test_ds_cnn_has_an_int8_form():
-    """The int8 model is smaller, has integer weights, and answers nearly as the float model."""
-    s = easy(12)
-    (method,) = methods.find(["ds-cnn"], methods.Effort(0.1))
-    model = method.train(s, s.samples, 1)
-    int8 = model.precisions["int8"]
-    assert cost.precision(int8.graph()) == "int8"
-    assert len(int8.graph().SerializeToString()) < 0.6 * len(model.graph().SerializeToString())
-    np.testing.assert_allclose(
-        softmax(int8.logits(s.samples)), softmax(model.logits(s.samples)), atol=0.25
-    )
 
 
 @pytest.mark.parametrize("classes", [3, 26])

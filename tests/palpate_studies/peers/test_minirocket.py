@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 
 from palpate.answer.objects import softmax
-from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
-from palpate_studies import cost
 from palpate_train.data.augment import copies
 from palpate_train.data.sets import Dataset
-from palpate_train.models import methods
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
@@ -221,19 +218,3 @@ def test_the_graph_answers_as_the_network(rows: int, window: int):
         network.train()(counts)  # moves the means of the norms
         want = network.eval()(counts).numpy()
     np.testing.assert_allclose(graph_builder.run(network.graph(), sweeps), want, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.thorough  # trains for seconds
-def test_lite_has_an_int8_form_that_the_box_reads():
-    """The int8 model has integer weights and answers nearly as the float model."""
-    s = easy(12)
-    (method,) = methods.find(["lite"], methods.Effort(0.05))
-    model = method.train(s, s.samples, 1)
-    assert (model.logits(s.samples).argmax(1) == s.labels).mean() > 0.8
-    int8 = model.precisions["int8"]
-    assert cost.precision(int8.graph()) == "int8"
-    reader.read(int8.graph().SerializeToString())
-    np.testing.assert_allclose(
-        softmax(int8.logits(s.samples)), softmax(model.logits(s.samples)), atol=0.25
-    )

@@ -128,21 +128,6 @@ def test_a_patch_holds_all_axes_of_its_taxels():
     assert all(np.abs(cut - one).max(axis=(1, 2, 3)).min() < 1e-5 for one in patch[:20])
 
 
-def test_an_offset_changes_nothing():
-    """A constant load on a taxel does not change the codes."""
-    rng = np.random.default_rng(3)
-    sweeps = rng.integers(0, 100, (2, 64, 4, 4)).astype(np.int16)
-    graph = sthmp.pooled(SweepFormat(4, 4, 50.0, 64, "int16"), atoms(7), 0.03)
-    moved = sweeps + rng.integers(-900, 900, (2, 1, 4, 4)).astype(np.int16)
-    np.testing.assert_allclose(
-        graph_builder.run(graph, moved), graph_builder.run(graph, sweeps), rtol=0, atol=1e-3
-    )
-    assert (
-        np.abs(graph_builder.run(graph, sweeps[::-1]) - graph_builder.run(graph, sweeps)).max()
-        > 0.05
-    )
-
-
 def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.MonkeyPatch):
     """Of patches of two out of twenty atoms most are found, and the residual is small."""
     monkeypatch.setattr("palpate_studies.peers.sthmp.ACTIVE", 2)

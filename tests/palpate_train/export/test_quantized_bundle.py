@@ -34,6 +34,7 @@ from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
+from palpate_train.data.sets import Dataset
 from palpate_train.export import contents, pack, quantized_bundle
 from palpate_train.export.contents import ExportRefused
 from palpate_train.metrics import bundle_score, tolerances
@@ -48,7 +49,6 @@ from palpate_train.models.recipe.sizes import SIZES
 from palpate_train.onnx_tools import graph_builder, parity
 from palpate_train.onnx_tools.quantize import quantize
 from tests.factories.later import Later
-from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import with_stages
 
@@ -59,6 +59,19 @@ stages = Later("palpate_train.models.recipe.stages")
 pytestmark = pytest.mark.slow
 ALONE_AND_FUSED = ("network alone", "by recording")
 """Figures beside that of the box's answers to single sweeps."""
+
+
+def close(n: int = 80) -> Dataset:
+    """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates, in much noise."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(3), n)
+    pitch = np.array([0.11, 0.15, 0.2])[labels] * rng.uniform(0.9, 1.1, 3 * n)
+    phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((3 * n, 1)))
+    offset = rng.uniform(80, 120, (3 * n, 1, 2, 2))
+    samples = offset + 12 * np.sin(phase)[:, :, None, None]
+    samples = (samples + 8 * rng.standard_normal((3 * n, 64, 2, 2))).astype("uint8")
+    groups, names = {"recording": np.arange(3 * n)}, ("low", "middle", "high")
+    return Dataset(samples, labels, names, 100.0, groups, "close")
 
 
 @pytest.fixture(scope="module")
