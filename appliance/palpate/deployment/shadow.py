@@ -219,8 +219,8 @@ class Shadow(Observer):
         """At the end of a turn: write one file that is due, unless a sweep is open."""
         if health.sweeping or self._busy:
             return
-        if self._waiting and self._beside(partial(self._sweeps.put, *self._waiting[0])):
-            self._waiting.pop(0)
+        if self._waiting:
+            self._beside(partial(self._sweeps.put, *self._waiting[0]), of_first=True)
         elif not self._waiting and self._clock.now_ns() >= self._due_ns:
             self._beside(self._writing())
 
@@ -270,16 +270,16 @@ class Shadow(Observer):
                 f"times in a row: {why}; classifying goes on"
             )
 
-    def _beside(self, act: Callable[[], object]) -> bool:
-        """Do `act` beside the loop; False if that is not possible now."""
+    def _beside(self, act: Callable[[], object], *, of_first: bool = False) -> None:
+        """Do `act` beside the loop, if that is possible now. of_first: it keeps the first of the
+        waiting sweeps, which waits no longer then."""
 
         def done(succeeded: bool) -> None:
             self._busy, self.agreement.kept = False, len(self._sweeps.numbers)
+            del self._waiting[:of_first]
 
         self._busy = True
-        accepted = self._disk(lambda: self._log.attempt(act), done)
-        self._busy = self._busy and accepted
-        return accepted
+        self._busy = self._disk(lambda: self._log.attempt(act), done) and self._busy
 
     def _writing(self) -> Callable[[], None]:
         """The write of the counts as they are now."""

@@ -237,7 +237,7 @@ class TeachingSession(Observer):
         if now["material"] not in ("", label) and now["position"].isdecimal():
             self._recording.commands["POSITION"](self._place)  # each material begins there
         self._recording.commands["MATERIAL"](label)
-        return [label, self.materials().get(label, 0)]
+        return [label, self.materials().get(label, 0) + self._recording.coming(label)]
 
     def _material(self, label: str) -> Reply:
         self.admit(*filter(None, [label.strip()]))
@@ -269,11 +269,14 @@ class TeachingSession(Observer):
             self._learnt = {**self._learnt, "suspects": kept}
         self._due_ns = self._clock.now_ns() + PAUSE_NS
 
-    def _use(self, _: str) -> list[object]:
-        """Begin to teach all sweeps; returns the number of materials and of sweeps."""
+    def _use(self, _: str) -> Reply:
+        """Begin to teach all sweeps, once they are written; returns the number of materials and of
+        sweeps."""
         if self._using:
             raise ApplianceError("a bundle is being made already; wait for TCH")
-        self._recording.refuse_while_changing()
+        return self._recording.once_written(self._used, "USE")
+
+    def _used(self) -> list[object]:
         held = {name: n for name, n in self._taught().items() if n}
         if len(held) < self._fewest:
             why = "teach one" if self._base else "a model tells at least two apart: teach another"
@@ -288,13 +291,14 @@ class TeachingSession(Observer):
     def _forget(self, label: str) -> Reply:
         """Teach a material no longer; returns it and the number of its sweeps."""
         label = label.strip()
-        number = self.materials().get(label)
-        if number is None:
+        coming = self._recording.coming(label)
+        if label not in self.materials() and not coming:
             raise ApplianceError(
                 f"there is no material {label!r} to forget; name one that was recorded"
             )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
+        number = self.materials().get(label, 0) + coming
         return self._recording.forget(label, partial(self._forgotten, label, number))
 
     def _forgotten(self, label: str, number: int) -> list[object]:

@@ -153,6 +153,13 @@ class RecordingSession(Observer):
         """The number of its sweeps that are being written and will count."""
         return sum(held == (material, True) for held in self._writing.values())
 
+    def once_written(self, act: Callable[[], list[object]], what: str) -> Reply:
+        """Do `act` for the reply once all sweeps so far are written. Raises ApplianceError."""
+        self.refuse_while_changing()
+        if not self._writing:
+            return act()
+        return self._beside(lambda: None, act, what, "try again")
+
     def settle(self) -> None:
         """Wait until all sweeps are written, for some seconds at most."""
         self._disk.settle()
@@ -161,7 +168,7 @@ class RecordingSession(Observer):
         """Raises ApplianceError while such a change is not on the disk yet."""
         if self._changes:
             raise ApplianceError(
-                "DISCARD, FORGET, MOVE, RENAME or UNDO is under way; wait for its answer"
+                "DISCARD, FORGET, MOVE, RENAME, UNDO or USE is under way; wait for its answer"
             )
 
     def leave_out(self, number: int) -> None:
@@ -173,6 +180,7 @@ class RecordingSession(Observer):
         """Learn no longer from the sweeps of a material so far, those that are still being written
         included; they stay in the folder. done: called when that is on the disk; returns the fields
         of the reply. Raises ApplianceError."""
+        self.refuse_while_changing()  # which may move sweeps to this material, or away
         held = [n for n, labels in self._counted.items() if labels.material == material]
         waiting = [n for n, (label, _) in self._writing.items() if label == material]
         numbers = *held, *waiting
@@ -206,8 +214,11 @@ class RecordingSession(Observer):
                 why = f"{what}: {getattr(e, 'strerror', None) or e}; {advice}"
                 log.warning(f"record: {why}, and repeat it")
                 reply.set_exception(ApplianceError(why))
-            else:
+                return
+            try:
                 reply.set_result(done())
+            except ApplianceError as refused:
+                reply.set_exception(refused)
 
         self._changes += 1
         if not self._disk(tried, end):

@@ -28,6 +28,7 @@ from palpate.inference.classifier import Classifier
 from palpate.sim import rig, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND
+from tests.factories.slow_disk import SlowDisk
 
 IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim", *[0] * 6)
 SWEEPING = IDLE._replace(sweeping=True)
@@ -139,6 +140,21 @@ def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
         assert (len(pair.kept()), pair.written().compared) == (kept, compared)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(3, 6)))
     assert (len(pair.kept()), pair.written().kept, pair.written().compared) == (2, 2, 5)
+
+
+def test_a_sweep_that_is_being_written_counts_for_the_limit(side, monkeypatch):
+    """The disk is slow; of three sweeps on which they differ two are kept."""
+    monkeypatch.setattr(shadow, "KEPT", 2)
+    pair, disk = side(renamed), SlowDisk()
+    monkeypatch.setattr(pair.shadow, "_disk", disk)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 4)))
+    disk.settle()
+    pair.turn()
+    disk.settle()
+    assert len(pair.kept()) == 2
+    pair.judge(toy_bundle.sweep(0, 0, 4))
+    disk.settle()
+    assert (len(pair.kept()), pair.written().kept) == (2, 2)
 
 
 def test_it_fuses_by_the_same_rule(side):

@@ -338,6 +338,39 @@ def test_use_does_not_overtake_what_the_disk_still_has_to_do(tmp_path):
     one.recording.close()
 
 
+def test_sweeps_that_the_disk_still_has_to_write_are_counted_and_taught(tmp_path, monkeypatch):
+    """TEACH and FORGET count them, and USE begins once they are there; nothing overtakes it."""
+    disk = SlowDisk()
+    one = Taught(tmp_path, disk=disk)
+    begun: list[int] = []
+    monkeypatch.setattr(one.session, "_learn", lambda by: begun.append(one.recording.stored) or [])
+    monkeypatch.setattr(session, "TeachingProcess", mock.Mock())
+    for material, count in (("cork", 2), ("pine", 1), ("felt", 1)):
+        one.sweeps(material, count)
+        assert one.order("TEACH", material) == [material, count]
+    reply = one.order("USE")
+    for order in (("USE", ""), ("FORGET", "cork")):
+        with pytest.raises(ApplianceError, match="answer"):
+            one.order(*order)
+    disk.settle()
+    assert reply.result(0) == [3, 4]
+    assert begun == [4]
+    one.session.close()
+    one.recording.close()
+    fresh = Taught(tmp_path / "fresh", disk=disk)
+    fresh.sweeps("cork", 1)
+    reply = fresh.order("FORGET", "cork")
+    disk.settle()
+    assert reply.result(0) == ["cork", 1]
+    assert fresh.session.materials() == {}
+    fresh.sweeps("pine", 1)
+    reply = fresh.order("USE")
+    disk.settle()
+    with pytest.raises(ApplianceError, match="at least two"):
+        reply.result(0)
+    fresh.recording.close()
+
+
 def test_sweeps_are_assessed_again_after_a_discard(taught):
     """Removed; also with another in its place in one turn."""
     taught.sweeps("cork", 3)

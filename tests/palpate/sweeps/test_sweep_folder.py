@@ -135,6 +135,25 @@ def test_a_sweep_that_comes_while_its_material_is_renamed_has_the_new_name(tmp_p
     one.close()
 
 
+def test_nothing_is_forgotten_while_sweeps_are_moved(tmp_path):
+    """FORGET in the meantime would mark them under a name that they lose: a start taught them."""
+    disk = SlowDisk()
+    one = recording(tmp_path, disk)
+    put(one, 1)
+    disk.settle()
+    renamed = one.commands["RENAME"]("cork,oak")
+    with pytest.raises(ApplianceError, match="RENAME"):
+        one.forget("cork")
+    disk.settle()
+    assert renamed.result(0) == ["oak", 1]
+    one.forget("oak")
+    disk.settle()
+    one.close()
+    again = recording(tmp_path)
+    assert again.materials() == {}
+    again.close()
+
+
 def test_forget_and_discard_are_answered_once_the_card_has_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
