@@ -30,11 +30,13 @@ PARTS = 10
 class SlideLimits:
     """least: [K], for each trained label the least `vibration` of a part in which the finger
     slides; empty if that is unknown. pattern: least height of the pattern that passes from taxel to
-    taxel in a slide, as signal.slide measures it; None if slides need not show one. Raises
-    BundleError for a number out of range."""
+    taxel in a slide, as signal.slide measures it; None if slides need not show one. whole: whether
+    whole windows have to vibrate so, too; if not, `least` is of few sweeps, and what lies below is
+    only answered later. Raises BundleError for a number out of range."""
 
     least: tuple[float, ...]
     pattern: Positive | None = None
+    whole: bool = True
 
     def __post_init__(self) -> None:
         check(self, "sliding")
@@ -88,6 +90,8 @@ class Vibrates:
     def apply(self, context: Context) -> Refusal | None:
         """Refuse a sweep with a rest."""
         parts = PARTS * len(context.taxels) // self._window
+        if context.whole and not self._limits.whole:
+            return None
         if not parts or len(context.taxels) < 2 * parts:
             return None
         allowed = self._disturbances

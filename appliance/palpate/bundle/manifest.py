@@ -111,6 +111,8 @@ class Manifest:
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = asdict(self) | {"format": self.format.json()}
+        if self.sliding and self.sliding.whole:
+            del values["sliding"]["whole"]  # the usual
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property

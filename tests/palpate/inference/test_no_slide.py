@@ -18,7 +18,7 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.config import UNTIL_NEW_OBJECT
-from palpate.core.types import Status, Sweep
+from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.sim import skin
@@ -80,13 +80,19 @@ def test_without_a_limit_nothing_is_checked(toy):
     assert Classifier(older, VirtualClock())(resting(0, 0, 10, 14)).label == "a"
 
 
-def test_no_early_answer_to_a_finger_that_rests(toy):
-    """It rests in the second tenth of the window; half of the window has come."""
-    early = EarlyExit(Classifier(toy, VirtualClock()))
+@pytest.mark.parametrize("whole", [True, False])
+def test_no_early_answer_to_a_finger_that_rests(toy, whole):
+    """It rests in the second tenth of the window; half of the window has come. Limits of few sweeps
+    are for unfinished windows alone."""
+    limits = replace(toy.manifest.sliding, whole=whole)
+    box = Classifier(replace(toy, manifest=replace(toy.manifest, sliding=limits)), VirtualClock())
+    early = EarlyExit(box)
+    answered = Status.NO_SLIDE if whole else Status.OK
+    assert box(resting(0, 0, 2, 4)).status is answered
 
     def half(sweep: Sweep) -> Sweep:
-        frames = replace(sweep.frames, taxels=sweep.frames.taxels[:10])
-        return replace(sweep, frames=frames, share=0.5)
+        f = sweep.frames
+        return replace(sweep, frames=Frames(f.t_ns[:10], f.seq[:10], f.taxels[:10]), share=0.5)
 
     assert early(half(toy_bundle.sweep(0, 0)))
     assert early(half(resting(0, 0, 2, 4))) is None

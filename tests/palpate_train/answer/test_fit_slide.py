@@ -53,7 +53,7 @@ def test_the_range_covers_nearly_all_sweeps_or_has_a_reason():
 def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
     """No part of a training sweep rests by them; still parts and nine sweeps give none."""
     train = sets.load("sim:T-REAL/level-blind:41:1")
-    bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
+    bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None, early=None)
     monkeypatch.setattr(fit_slide, "_pattern", lambda train: None)
     assert fit_slide.limited(bare, train) is bare
     monkeypatch.setattr(fit_slide, "FEWEST_SLIDES", 9)
@@ -66,6 +66,22 @@ def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
     still[3, :150] = 80
     assert fit_slide.limited(bare, replace(train, samples=still)) is bare
     assert fit_slide.limited(bare, train.select(("material=metal,wood",))) is bare
+
+
+def test_early_answers_of_few_sweeps_need_motion_in_each_tenth():
+    """Nine sweeps limit unfinished windows alone, and stay where whole ones do not need them."""
+    train = sets.load("sim:T-REAL/level-blind:41:1")
+    made = bundle.load(bundle.DEFAULT)
+    few = fit_slide.limited(replace(made.manifest, sliding=None), train)
+    assert few.sliding
+    assert (len(few.sliding.least), few.sliding.whole) == (6, False)
+    assert "unfinished" in fit_slide.text(few)
+    less = fit_slide.without_vibration(made).manifest
+    assert less.sliding
+    assert (len(less.sliding.least), less.sliding.whole) == (6, False)
+    late = fit_slide.without_vibration(replace(made, manifest=replace(made.manifest, early=None)))
+    assert late.manifest.sliding
+    assert (late.manifest.sliding.least, late.manifest.sliding.whole) == ((), True)
 
 
 def test_the_packaged_bundle_sees_a_slide_that_ends_early():
@@ -86,7 +102,7 @@ def test_the_packaged_bundle_sees_a_slide_that_ends_early():
 
 def test_slides_need_a_pattern_where_training_always_showed_one():
     """Also with one sweep of each; without a pattern or with two taxels no limit."""
-    bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
+    bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None, early=None)
     train = sets.load("sim:T-LAB/level-blind:3:1")
     found = fit_slide.limited(bare, train)
     assert found.sliding

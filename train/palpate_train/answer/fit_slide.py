@@ -23,11 +23,11 @@ MOST_SWEEPS = 1000
 LEAST_SHARE, LEAST_SWEEPS = 0.2, 5
 """Least share and number of measured sweeps that give a range."""
 FEWEST_SLIDES = round(2 / OUTER)
-"""Least number of training sweeps of each label. The next sweep has less vibration than the least
-of n sweeps with a probability of 1 / (n + 1)."""
+"""Least number of training sweeps of each label whose least vibration refuses a whole window. The
+next sweep has less vibration than the least of n sweeps with a probability of 1 / (n + 1)."""
 STILL = 0.5 * float(np.log(TINY)) / 2
 """Below this vibration a part does not change at all."""
-_UNNOTICED = "a finger that rests: not noticed"
+UNNOTICED = "a finger that rests: not noticed"
 
 
 def slides(meter: SlideMeter, sweeps: Dataset) -> list[Slide]:
@@ -54,10 +54,12 @@ def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange 
 
 def limited(manifest: Manifest, train: Dataset) -> Manifest:
     """`manifest` with the limits of the training sweeps; unchanged if there are none."""
-    least, pattern = _least(manifest, train), _pattern(train)
+    whole = bool(np.bincount(train.labels, minlength=len(train.materials)).min() >= FEWEST_SLIDES)
+    least = _least(manifest, train) if whole or manifest.early else ()
+    pattern = _pattern(train)
     if not least and pattern is None:
         return manifest
-    return replace(manifest, sliding=SlideLimits(least, pattern))
+    return replace(manifest, sliding=SlideLimits(least, pattern, whole or not least))
 
 
 def _pattern(train: Dataset) -> float | None:
@@ -71,14 +73,9 @@ def _pattern(train: Dataset) -> float | None:
 
 
 def _least(manifest: Manifest, train: Dataset) -> tuple[float, ...]:
-    """The least vibration of each label.
-
-    Empty if there are fewer than FEWEST_SLIDES sweeps of a label, or if windows are too short. Also
-    empty if a part of a sweep does not change at all, since slides then resemble rests.
-    """
+    """The least vibration of each label; empty if windows are too short, and if a part of a sweep
+    does not change at all, since slides then resemble rests."""
     if train.format.window < 2 * PARTS or set(train.materials) != set(manifest.labels):
-        return ()
-    if np.bincount(train.labels, minlength=len(train.materials)).min() < FEWEST_SLIDES:
         return ()
     least = np.array([vibration(window, manifest.tare).min() for window in train.samples])
     labels = [train.materials.index(label) for label in manifest.labels]
@@ -92,10 +89,11 @@ def text(manifest: Manifest) -> str:
     """Whether a finger that rests is noticed, in words."""
     limits, by = manifest.sliding, []
     if limits and limits.least:
-        by.append("in each tenth of the window by its lack of vibration")
+        part = "the window" if limits.whole else "an unfinished sweep"
+        by.append(f"in each tenth of {part} by its lack of vibration")
     if limits and limits.pattern:
         by.append("in a whole window by its lack of a pattern that passes from taxel to taxel")
-    return f"a finger that rests: noticed {' and '.join(by)}" if by else _UNNOTICED
+    return f"a finger that rests: noticed {' and '.join(by)}" if by else UNNOTICED
 
 
 def without_pattern(bundle: Bundle) -> Bundle:
@@ -104,8 +102,10 @@ def without_pattern(bundle: Bundle) -> Bundle:
 
 
 def without_vibration(bundle: Bundle) -> Bundle:
-    """The bundle that needs no vibration in a slide."""
-    return _limits(bundle, least=())
+    """The bundle that needs no vibration in a slide; its early answers still do."""
+    if bundle.manifest.early:
+        return _limits(bundle, whole=False)
+    return _limits(bundle, least=(), whole=True)
 
 
 def _limits(bundle: Bundle, **changed: Any) -> Bundle:

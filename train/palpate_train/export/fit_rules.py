@@ -192,6 +192,11 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
             figures[name] = {"kept": False, "because": "absent"}
     for name in left_out:
         packed = RULES[name].without(packed)
+    if packed.manifest.early and not packed.manifest.sliding:
+        made = packed.manifest.made | {"early": fit_slide.UNNOTICED}
+        packed = RULES["early"].without(
+            replace(packed, manifest=replace(packed.manifest, made=made))
+        )
     figures = {rules.FIGURES: figures} if figures else {}
     several = len(np.unique(content.held_out.labels)) > 1  # junk is made of two materials
     if proven and several and packed.manifest.early:
