@@ -247,11 +247,14 @@ def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:
 
 class MeasureSlide:
     """Measures the slide in whole windows. pitch_mm: None if it is unknown or no speed is wanted;
-    then only the height of the pattern, and taxels a second, are measured. able: whether slides on
-    this skin can be measured at all."""
+    then only the height of the pattern, and taxels a second, are measured. bridged: also in sweeps
+    with bridged taxels, where ShowsPattern does not look. able: whether slides on this skin can be
+    measured at all."""
 
-    def __init__(self, format: SweepFormat, pitch_mm: float | None) -> None:
-        self._format, self._pitch_mm = format, pitch_mm
+    def __init__(
+        self, format: SweepFormat, pitch_mm: float | None, *, bridged: bool = True
+    ) -> None:
+        self._format, self._pitch_mm, self._bridged = format, pitch_mm, bridged
         self._meters = dict[int, SlideMeter]()  # by frames
         self.able = self._of(format.window).why is None
 
@@ -269,7 +272,7 @@ class MeasureSlide:
 
     def apply(self, context: Context) -> None:
         """Measure the slide."""
-        if not context.whole:
+        if not context.whole or (context.degraded and not self._bridged):
             return
         slide = self._of(len(context.taxels))(context.window)
         if not self._pitch_mm:

@@ -80,8 +80,9 @@ class Classifier(Observer):
     probabilities, and one touch beside the object must not invalidate the other sweeps.
 
     settings: a min_probability of 0 becomes the bundle's thresholds.unsure. slides: whether answers
-    have the speed of the slide; without it they take less time. Raises BundleError if onnxruntime
-    refuses the model. `bundle.load` has compared its inputs and outputs with the manifest.
+    have the speed of the slide; without it they take less time. model: of a classifier with the
+    same model. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared its
+    inputs and outputs with the manifest.
 
     taxels: the broken taxels. As an observer of the loop it searches the stream for them; without a
     stream they are found in each window alone.
@@ -93,6 +94,7 @@ class Classifier(Observer):
         clock: Clock,
         settings: ClassifierConfig = UNTIL_NEW_OBJECT,
         slides: bool = True,
+        model: ModelRunner | None = None,
     ) -> None:
         self.bundle, self._clock = bundle, clock
         least = settings.min_probability or bundle.manifest.thresholds.unsure
@@ -105,7 +107,7 @@ class Classifier(Observer):
         self._means = class_distances(bundle, settings.strangers)
         self._outputs = ("logits", *("embedding",) * (self._means is not None))
         # early heads get a session of their own
-        self._model = ModelRunner(bundle.model, *self._outputs)
+        self.model_runner = model or ModelRunner(bundle.model, *self._outputs)
         self._cleaning: list[Stage] = [self.taxels]
         if m.disturbances and m.disturbances.hum:
             self._cleaning.append(HumFilter(m.format, m.disturbances.hum))
@@ -127,9 +129,10 @@ class Classifier(Observer):
         if m.contact and m.thresholds.contact is not None:
             stages.append(LocateContact(m.contact, m.thresholds.contact))
         pitch_mm = m.contact.pitch_mm if m.contact and slides else None
-        wanted = pitch_mm or m.disturbances or (m.sliding and m.sliding.pattern)
-        self._slide = MeasureSlide(m.format, pitch_mm) if wanted else None
-        if self._slide:
+        wanted, pattern = bool(pitch_mm or m.disturbances), m.sliding and m.sliding.pattern
+        self._slide = None
+        if wanted or pattern:
+            self._slide = MeasureSlide(m.format, pitch_mm, bridged=wanted)
             stages.append(self._slide)
         if m.disturbances:
             stages.append(MeasureDisturbances(unloaded=bool(m.unloaded)))
@@ -204,11 +207,11 @@ class Classifier(Observer):
         """The named outputs of the graph for one window of raw counts [T, R, C] or [T, R, C, A],
         without the leading axis of length 1."""
         m = self.bundle.manifest
-        return self._model(names, features.graph_input(m.input, taxels, m.format.rate_hz))
+        return self.model_runner(names, features.graph_input(m.input, taxels, m.format.rate_hz))
 
     def prepare(self, *outputs: str) -> None:
         """Open the session of these outputs now, so that the first sweep does not wait for it."""
-        self._model.prepare(*outputs)
+        self.model_runner.prepare(*outputs)
 
     def test(self) -> str:
         """The result of `self_test` in words."""

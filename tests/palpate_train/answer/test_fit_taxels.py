@@ -112,7 +112,7 @@ class Weighed:
     """A box that names a material by the load of taxel 1.1."""
 
     def __init__(self, told: bundle.Bundle, *rest: Any, **more: Any) -> None:
-        self.bundle = told
+        self.bundle, self.model_runner = told, None
 
 
 @pytest.mark.slow

@@ -112,8 +112,13 @@ def heads(z: Array, labels: Array, classes: int) -> Heads:
 
     A label without a sweep gets logits far below all others.
     """
-    steps = [lda(z[:, d], labels, classes) for d in range(z.shape[1] - 1)]
-    return Heads(np.stack([weight for weight, _ in steps]), np.stack([bias for _, bias in steps]))
+    steps = z.shape[1] - 1
+    made = Heads(
+        np.empty((steps, z.shape[2], classes), np.float32), np.empty((steps, classes), np.float32)
+    )
+    for d in range(steps):
+        made.weight[d], made.bias[d] = lda(z[:, d], labels, classes)
+    return made
 
 
 def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
@@ -198,6 +203,8 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
     turns more than LOST of the sweeps from right to wrong. A looser level that seems to do
     better after that does so by chance (fixed sequence testing; Maurer et al. 1995).
     """
+    if probabilities.shape[1] == 1:
+        return EarlyRule(None, "no beginnings of sweeps were looked at", n=len(labels))
     if (n := len(labels)) < MIN_SWEEPS:
         return EarlyRule(
             None,

@@ -26,6 +26,7 @@ from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
+from palpate.inference.session import ModelRunner
 from palpate_train.data.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
@@ -102,8 +103,7 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
             lines[name], figures[f"one {name}"] = bench.judged(mask)
     row, column = lines["row"], lines["column"]
     limits = replace(limits, taxels=taxels, row=row, column=column)
-    bench = _Bench.of(bundle, limits, test, test, seed)
-    saturated, figures[CLIPPED] = bench.clipped()
+    saturated, figures[CLIPPED] = bench.by(limits).clipped()
     return Tolerance(limits, saturated, figures)
 
 
@@ -116,10 +116,13 @@ def _better(
     near = _Bench.of(bundle, rule, test, sample, seed)
     if loads is None:
         return near
-    told = _Bench.of(bundle, replace(rule, loads=loads), test, sample, seed)
-    single = np.zeros(near.signal.shape, bool)
-    worst = [bench.worst(map(_with(single), bench.places()))[1] for bench in (near, told)]
-    return told if worst[1] > worst[0] + GAIN * len(sample.sweeps) else near
+    told = near.by(replace(rule, loads=loads))
+    single = [*map(_with(np.zeros(near.signal.shape, bool)), near.places())]
+    worst, likely = near.worst(single)
+    enough = likely + GAIN * len(sample.sweeps)
+    # that place first: most often it shows that loads are not better
+    better = told.worst([worst])[1] > enough and told.worst(single)[1] > enough
+    return told if better else near
 
 
 def load_modes(sound: Dataset) -> LoadModes | None:
@@ -173,7 +176,7 @@ class _Bench:
         self, box: Classifier, test: EvaluationSweeps, sample: EvaluationSweeps, seed: int
     ) -> None:
         self._box, self._test, self._sample, self._seed = box, test, sample, seed
-        self._likely: dict[bytes, float] = {}
+        self._counted = dict[tuple[int, str, bytes], list[Any]]()
         self.signal = test.deviation.reshape(*test.deviation.shape[:2], -1).sum(axis=2)
 
     @classmethod
@@ -184,14 +187,21 @@ class _Bench:
         test: EvaluationSweeps,
         sample: EvaluationSweeps,
         seed: int,
+        model: ModelRunner | None = None,
     ) -> _Bench:
         """With the box that bridges by `rule` and accepts all counts at full scale. It measures no
         disturbances, which would take a quarter of the time: the sweeps have none but the
         faults."""
         limits = replace(bundle.manifest.thresholds, saturated=1.0)
         manifest = replace(bundle.manifest, bridging=rule, thresholds=limits, disturbances=None)
-        box = Classifier(replace(bundle, manifest=manifest), SystemClock(), slides=False)
+        bundle = replace(bundle, manifest=manifest)
+        box = Classifier(bundle, SystemClock(), slides=False, model=model)
         return cls(box, test, sample, seed)
+
+    def by(self, rule: Bridging) -> _Bench:
+        """The same with another rule."""
+        given = self._test, self._sample, self._seed, self._box.model_runner
+        return _Bench.of(self._box.bundle, rule, *given)
 
     @property
     def loads(self) -> LoadModes | None:
@@ -211,23 +221,14 @@ class _Bench:
 
     def worst(self, masks: Iterable[Array]) -> tuple[Array, float]:
         """The mask [R, C] whose taxels, dead, leave the true materials the least probability, and
-        its sum over the sample. Each mask is tried once: single taxels are searched twice."""
-
-        def likely(mask: Array) -> float:
-            key = mask.tobytes()
-            if key not in self._likely:
-                counts = self._counts(self._broken("dead", mask, self._sample))
-                self._likely[key] = float(counts[2])
-            return self._likely[key]
-
-        return min(((mask, likely(mask)) for mask in masks), key=lambda found: found[1])
+        its sum over the sample."""
+        found = ((mask, float(self._with("dead", mask, self._sample)[2])) for mask in masks)
+        return min(found, key=lambda one: one[1])
 
     def judged(self, mask: Array) -> tuple[bool, dict[str, Any]]:
         """Whether the box answers as with a sound skin while the taxels of `mask` [R, C] are dead
         or stuck, and [right, wrong] by fault with the places."""
-        counts = {
-            fault: self._counts(self._broken(fault, mask, self._test))[:2] for fault in TAXEL_FAULTS
-        }
+        counts = {fault: self._with(fault, mask, self._test)[:2] for fault in TAXEL_FAULTS}
         return self._holds(counts), counts | {"at": places(mask)}
 
     def clipped(self) -> tuple[float | None, dict[str, Any]]:
@@ -253,6 +254,14 @@ class _Bench:
 
     def _holds(self, counts: Mapping[str, list[int]]) -> bool:
         return all(self._near(counts[fault][0], counts[fault][1], LOST) for fault in SILENT)
+
+    def _with(self, fault: str, mask: Array, test: EvaluationSweeps) -> list[Any]:
+        """The `_counts` with a fault, computed once: single taxels are searched twice, and of few
+        sweeps all search and judge."""
+        key = len(test.sweeps), fault, mask.tobytes()
+        if key not in self._counted:
+            self._counted[key] = self._counts(self._broken(fault, mask, test))
+        return self._counted[key]
 
     def _broken(self, fault: str, mask: Array, test: EvaluationSweeps) -> Dataset:
         samples, rng = test.sweeps.samples, np.random.default_rng([self._seed, *fault.encode()])

@@ -154,7 +154,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=_closed(part.labels, task.left_out), materials=others)
     made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
-    given = calibration_inputs(made)
+    given = calibration_inputs(made, early=True, displaced=True)
     copies = given.copied
     places = sweeps.groups.get("position", sweeps.group("recording"))
     return Case(

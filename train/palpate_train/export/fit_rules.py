@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate_train.answer import (
     altered_sweeps,
@@ -35,9 +34,9 @@ from palpate_train.answer.rules import RULES, Asked
 from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.export import trial
 from palpate_train.export.bundle_graph import bundle_graph
-from palpate_train.export.contents import Content, files_of
+from palpate_train.export.contents import Content
 from palpate_train.models.recipe.fitted import Fit, calibration_inputs
-from palpate_train.onnx_tools.graph_builder import run
+from palpate_train.onnx_tools.graph_builder import run, slim
 
 
 def from_features(
@@ -58,7 +57,7 @@ def from_features(
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule
     figures = fit.held_out_figures()
-    prefixes = fit.trunk(prefixes=True) if rule.early else None
+    trunk, prefixes = fit.trunk(), fit.trunk(prefixes=True) if rule.early else None
     given = fit.given or calibration_inputs(fit)
     apart = _unseen(given, calibration)
     few = given.junk or altered_sweeps.few(fit.held)
@@ -75,8 +74,8 @@ def from_features(
         figures |= {altered_sweeps.FIGURES: found.figures}
     content = replace(
         content,
-        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=classes[0]),
-        model=bundle_graph(calibration, fit.trunk(), prefixes),
+        unseen=replace(content, model=bundle_graph(apart, trunk), classes=classes[0]),
+        model=bundle_graph(calibration, trunk, prefixes),
         early=rule.early,
         displacement=calibration.displacement_rule(),
         classes=classes[1],
@@ -172,16 +171,17 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
 def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -> Bundle:
     """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
     that do not pay. Heads judge that have not seen the held-out sweeps. A skin may have taxels
-    without a signal in sound sweeps; no broken taxel is bridged on it."""
+    without a signal in sound sweeps; no broken taxel is bridged on it. Nothing answers early where
+    no limit tells a slide from a rest."""
     left_out, figures = list(asked.left_out), dict[str, Any]()
     seed = int(content.about.get("seed", 0))
     if proven:
         judging = packed
         if content.unseen:
-            files = files_of(content.unseen)
-            entries = {name: bundle.file_entry(data) for name, data in files.items()}
-            text = replace(packed.manifest, files=entries, early=None).json()
-            judging = bundle.from_files(files | {bundle.MANIFEST: text}, packed.manifest.name)
+            model = slim(content.unseen.model).SerializeToString()
+            manifest = replace(packed.manifest, early=None)
+            classes = content.unseen.classes
+            judging = replace(packed, manifest=manifest, model=model, classes=classes)
         if not packed.manifest.thresholds.dead_taxels:
             found = fit_taxels.measure(judging, content.train, content.held_out, seed)
             packed, judging = (

@@ -12,13 +12,6 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnxruntime.quantization import (
-    CalibrationDataReader,
-    CalibrationMethod,
-    QuantFormat,
-    QuantType,
-    quantize_static,
-)
 
 Array = NDArray[Any]
 CALIBRATION_SWEEPS = 96
@@ -45,23 +38,32 @@ def quantize(
     Weights have seven bits: two products of eight bits overflow the 16-bit sums of an x86 without
     VNNI, and the answer there would differ from the answer on Arm.
     """
+    from onnxruntime import quantization as ort  # not for the constants of this module alone
+
+    left = iter(calibration_sweeps(sweeps))
+
+    class Sweeps(ort.CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types
+        def get_next(self) -> dict[str, Array] | None:
+            sweep = next(left, None)
+            return None if sweep is None else {"sweep": sweep[None]}
+
     copy = onnx.ModelProto()
     copy.CopyFrom(model)  # a copy, because onnxruntime moves the weights of its argument to a file
     # nothing to simplify beforehand
     copy.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         path = Path(folder) / "int8.onnx"
-        quantize_static(
+        ort.quantize_static(
             copy,
             path,
-            _CalibrationReader(calibration_sweeps(sweeps)),
-            QuantFormat.QDQ,
+            Sweeps(),
+            ort.QuantFormat.QDQ,
             list(ops),
             per_channel=True,
             reduce_range=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            calibrate_method=CalibrationMethod.Percentile,
+            activation_type=ort.QuantType.QUInt8,
+            weight_type=ort.QuantType.QInt8,
+            calibrate_method=ort.CalibrationMethod.Percentile,
             extra_options={"CalibPercentile": PERCENTILE},
         )
         made = onnx.load(path)
@@ -78,15 +80,3 @@ def calibration_sweeps(sweeps: Array) -> Array:
         np.linspace(0, len(sweeps) - 1, min(CALIBRATION_SWEEPS, len(sweeps))).astype(int)
     ]
     return some
-
-
-class _CalibrationReader(CalibrationDataReader):  # type: ignore[misc]  # onnxruntime ships no types
-    """Hands sweeps to the calibration one by one."""
-
-    def __init__(self, sweeps: Array) -> None:
-        self._left = iter(sweeps)
-
-    def get_next(self) -> dict[str, Array] | None:
-        """The next input of the graph, None at the end."""
-        sweep = next(self._left, None)
-        return None if sweep is None else {"sweep": sweep[None]}

@@ -42,7 +42,7 @@ def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    settings = recipe.Settings(most=len(lesson.sweeps))
+    settings = recipe.Settings(most=len(lesson.sweeps), displaced=False)
     setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
     setup = replace(setup, strangers=lesson.strangers)
     fixed = setup.fixed

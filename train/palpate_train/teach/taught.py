@@ -43,7 +43,7 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings())
+    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings(displaced=False))
     setup = replace(setup, strangers=lesson.strangers)
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step

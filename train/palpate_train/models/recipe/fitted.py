@@ -27,6 +27,7 @@ from palpate_train.answer import stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_early import no_limits
 from palpate_train.answer.heads import HeadData, HeadPlan
 from palpate_train.data.augment import COPIES, Augmentation, copies
 from palpate_train.data.junk import JUNK, windows
@@ -283,23 +284,27 @@ def named(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
-def finished(fit: Fit, known: HeadData | None = None) -> Fit:
-    """`fit` with its contacts, and with its calibration if there are sweeps to judge it by. known:
-    as for `calibration_inputs`."""
+def finished(fit: Fit, known: HeadData | None = None, displaced: bool = True) -> Fit:
+    """`fit` with its contacts, and with its calibration if there are sweeps to judge it by, and
+    enough for its early answers. known, displaced: as for `calibration_inputs`."""
     fit = replace(fit, contacts=fit.contacts or Contacts.of(fit.train), calibration=None)
     try:
-        given = calibration_inputs(fit, known)
+        early = not no_limits(len(fit.held))
+        given = calibration_inputs(fit, known, early, displaced)
         calibration = fit_calibration(given)
     except FormatError as e:  # nothing was held out, or of too few groups
         return replace(fit, uncalibrated=str(e))
     return replace(fit, calibration=calibration, given=given if given.junk else None)
 
 
-def calibration_inputs(fit: Fit, known: HeadData | None = None) -> CalibrationInputs:
+def calibration_inputs(
+    fit: Fit, known: HeadData | None = None, early: bool = False, displaced: bool = False
+) -> CalibrationInputs:
     """Features from the trunk of `fit`: of the training sweeps, the held-out sweeps and the copies
     with faults, in this order, and of augmented copies of the first two. known: the training sweeps
-    with their copies, if there are such features already. Raises FormatError if no sweep was held
-    out."""
+    with their copies, if there are such features already. early: of all prefixes of the window, not
+    of the whole alone. displaced: with displaced copies of the held-out sweeps. Raises FormatError
+    if no sweep was held out."""
     train, held, seed = fit.train, fit.held, fit.about["seed"]
     if (by := fit.about["held_out_by"]) == "nothing":
         hold_out(train, seed)  # raises, with the reason
@@ -313,14 +318,15 @@ def calibration_inputs(fit: Fit, known: HeadData | None = None) -> CalibrationIn
     }
     labels = np.concatenate([s.labels for s in of_all])
     recordings = np.concatenate([s.group("recording") for s in of_all])
+    seen = run(fit.trunk(prefixes=early), np.concatenate([s.samples for s in of_all]))
     return CalibrationInputs(
-        run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
+        seen if early else seen[:, None],
         labels,
         conditions,
         role == 1,
         bool(fit.architecture.channels),
         fit.bands,
-        _augmented_copies(fit, known),
+        _augmented_copies(fit, known, displaced),
         role == 2,
         fit.plan,
         np.concatenate([s.groups[WEIGHT] for s in of_all]) if WEIGHT in train.groups else None,
@@ -342,22 +348,23 @@ def _junk(fit: Fit) -> Mapping[str, Array]:
     }
 
 
-def _augmented_copies(fit: Fit, known: HeadData | None) -> AugmentedCopies:
+def _augmented_copies(fit: Fit, known: HeadData | None, displaced: bool) -> AugmentedCopies:
     """Copies of the training sweeps as the heads see them, and displaced copies of the held-out
     sweeps, whose numbers come after those of the training sweeps. Where heads see no copies, one
-    of each training sweep suffices."""
+    of each training sweep suffices beside displaced ones, and none without."""
     trunk, seed = fit.trunk(), fit.about["seed"]
 
     def seen(sweeps: Dataset, change: Augmentation, drawn: int, count: int) -> Array:
         every = copies(sweeps, change, drawn, count)
-        return np.concatenate([run(trunk, copy.samples) for copy in every])
+        none = np.empty((0, fit.weights["head.weight"].shape[1]), np.float32)
+        return np.concatenate([none, *(run(trunk, copy.samples) for copy in every)])
 
-    each = COPIES if any(part.copies for part in fit.plan.parts) else 1
+    each = COPIES if any(part.copies for part in fit.plan.parts) else int(displaced)
     of_train = known.copied if known else seen(fit.train, fit.augmentation, seed, each)
-    moved = fit.augmentation.without_faults()
-    of_held = seen(fit.held, moved, seed + HELD_COPIES_SEED, COPIES)
+    moved, count = fit.augmentation.without_faults(), COPIES * displaced
+    of_held = seen(fit.held, moved, seed + HELD_COPIES_SEED, count)
     numbers = np.arange(len(fit.train)), len(fit.train) + np.arange(len(fit.held))
-    source = np.concatenate([np.resize(numbers[0], len(of_train)), np.tile(numbers[1], COPIES)])
+    source = np.concatenate([np.resize(numbers[0], len(of_train)), np.tile(numbers[1], count)])
     labels = np.append(fit.train.labels, fit.held.labels)[source]
     is_held = np.repeat([False, True], [len(of_train), len(of_held)])
     return AugmentedCopies(np.concatenate([of_train, of_held]), labels, source, is_held)

@@ -90,15 +90,17 @@ class Settings:
     steps: of the training of stages; 0, the usual, for no stages. On none of seven recorded sets by
     which nothing was chosen did they gain, and they took up to nine tenths of the time. size:
     limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
-    calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
-    will have other values in service; without any, all that can be left out. most: largest number
-    of sweeps that are used; of more, some are drawn, see thinning.thinned.
+    calibration and contacts, which a bundle needs and `evaluate` does not. displaced: whether
+    displaced contacts are calibrated; they need the distance between taxels. varies: the groups
+    that will have other values in service; without any, all that can be left out. most: largest
+    number of sweeps that are used; of more, some are drawn, see thinning.thinned.
     """
 
     steps: int = 0
     size: ModelSize = UNLIMITED
     use: SkinUse = AS_RECORDED
     calibrate: bool = True
+    displaced: bool = True
     varies: tuple[str, ...] = ()
     most: int = MOST_SWEEPS
 
@@ -400,7 +402,8 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
     if not settings.calibrate:
         return made
     drawn = fixed.data.drawn and setup.judging.group != "nothing"
-    return finished(made, known.seen(columns).take(~setup.judging.out) if drawn else None)
+    copied = known.seen(columns).take(~setup.judging.out) if drawn else None
+    return finished(made, copied, settings.displaced)
 
 
 def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk:
