@@ -20,8 +20,8 @@ flood must not reach it. Also the least time between two commands of one peer, r
 included, so that a flooding peer leaves the others their turn."""
 ANSWER_S, STORED_S = 2.0, 30.0
 """Longest wait for the box's answer to a command, and to one of STORED."""
-STORED = ("DISCARD", "FORGET", "MOVE", "RENAME", "UNDO")
-"""Commands that the box answers once the change is on its disk; others it answers meanwhile."""
+STORED = ("DISCARD", "FORGET", "MOVE", "RENAME", "UNDO", "USE")
+"""Commands that the box answers once it has written to its disk; others it answers meanwhile."""
 QUESTIONS = ("ID", "STATE", "LABEL")
 """Commands that change nothing and need no permission."""
 
