@@ -114,7 +114,7 @@ def early(case: Case, done: Calibration) -> Json:
     whole = p[:, -1].argmax(1) == labels
     named, share = decide(p, found.early) if found.early else (p[:, -1].argmax(1), np.ones(len(p)))
     lost = whole.astype(float) - (named == labels)
-    low, high = uncertainty.bootstrap(partial(_mean_of, lost), places)
+    low, high = uncertainty.bootstrap(lambda some: float(lost[some].mean()), places)
     rule = {
         "least": found.early.least[0] if found.early else None,
         "agree": found.early.agree if found.early else None,
@@ -136,7 +136,3 @@ def early(case: Case, done: Calibration) -> Json:
 def _accuracy(right: Array, clusters: Array) -> Json:
     low, high = interval(right, clusters)
     return {"accuracy": round(float(right.mean()), 4), "low": low, "high": high}
-
-
-def _mean_of(values: Array, some: Array) -> float:
-    return float(values[some].mean())

@@ -22,27 +22,12 @@ def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
     Entries have `mean`, `low` and `high`. Without peers the verdict says so.
     """
     if not peers:
-        return {
-            "what": what,
-            "ours": ours,
-            "best": "",
-            "leader": None,
-            "gap": None,
-            "verdict": "no peer was run",
-            "short": False,
-        }
+        found: Json = {"best": "", "leader": None, "gap": None, "short": False}
+        return {"what": what, "ours": ours, "verdict": "no peer was run", **found}
     best = max(peers, key=lambda name: float(peers[name]["mean"]))
     gap = differences.difference(differences.of(ours), differences.of(peers[best]))
-    short = gap[0] < NEAR - ROUNDING
-    return {
-        "what": what,
-        "ours": ours,
-        "best": best,
-        "leader": peers[best],
-        "gap": gap,
-        "verdict": verdict(gap),
-        "short": short,
-    }
+    found = {"best": best, "leader": peers[best], "gap": gap, "short": gap[0] < NEAR - ROUNDING}
+    return {"what": what, "ours": ours, "verdict": verdict(gap), **found}
 
 
 def verdict(gap: Estimate) -> str:

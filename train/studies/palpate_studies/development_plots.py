@@ -126,7 +126,9 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float], few: bool) 
     about = f"classified correctly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
     axes.yaxis.set_label_coords(-0.115, 1.03)
-    _text(axes, finding(panel), (-0.115, 1.03), (0, 13), BLACK, weight="bold", size=MEDIUM)
+    look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    look |= {"color": BLACK, "weight": "bold", "size": MEDIUM}
+    axes.annotate(finding(panel), (-0.115, 1.03), (0, 13), **look)
     front = [(spot.ms, spot.mean) for spot in panel.front]
     corners = [(x, y) for a, b in pairwise(front) for x, y in (a, (b[0], a[1]))]
     stairs = [*corners, *front[-1:], *((ends[1], y) for _, y in front[-1:])]
@@ -176,17 +178,3 @@ def _between(line: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         for a, b in pairwise(line)
         for t in np.linspace(0, 1, STEPS)
     ]
-
-
-def _text(
-    axes: Axes,
-    text: str,
-    at: tuple[float, float],
-    offset: tuple[float, float],
-    shade: str,
-    **style: Any,
-) -> None:
-    """Write `text` at a point in shares of the axes, moved by `offset` in points."""
-    look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
-    look |= {"size": SMALL} | style
-    axes.annotate(text, at, offset, color=shade, **look)

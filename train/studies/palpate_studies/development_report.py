@@ -39,7 +39,11 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
     cases = {case["case"]: case for case in figures["cases"] if ours in table.get(case["case"], {})}
-    lines = [comparison_line(one, table[case], ours, names) for case, one in cases.items()]
+    lines = []
+    for case, one in cases.items():
+        row = table[case]
+        peers = {plain_name(n): row[n] for n in names if n not in OURS and n in row}
+        lines.append(comparison.line(plain_case(one), row[ours], peers))
     shown = panels(figures)
     pictures = {"front": front(figures)} if shown else {}
     page = html.render(
@@ -95,12 +99,6 @@ def subject(table: Mapping[str, Accuracies]) -> str:
     raise FormatError(
         f"no result of {' or '.join(OURS)}; run the command without --kept, or with one of them"
     )
-
-
-def comparison_line(case: Json, row: Accuracies, ours: str, names: Sequence[str]) -> dict[str, Any]:
-    """Ours beside the best peer in one test."""
-    peers = {plain_name(name): row[name] for name in names if name not in OURS and name in row}
-    return comparison.line(plain_case(case), row[ours], peers)
 
 
 def _mean_rows(shown: Sequence[ChartPanel], names: Sequence[str]) -> list[Json]:

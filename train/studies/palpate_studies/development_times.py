@@ -10,7 +10,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.export import measure
 from palpate_train.metrics import score
 from palpate_train.models import methods
-from palpate_train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method, model_inputs
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -139,14 +138,18 @@ def _callable(
     alone = {"method": method.name, "form": "", "precision": "float", "runs_on_box": False}
     if method.library:
         model = method.train(few, model_inputs(method.input, few), seed)
-        return [(alone | {"runtime": method.library}, partial(_alone, model))]
+        return [(alone | {"runtime": method.library}, lambda counts: model.logits(counts[None])[0])]
     folder = precisions.kept_folder(method, sweeps, seed, cache)
     try:
         made = precisions.packed(method, sweeps, seed, folder)
     except BundleError as e:
         return list(_refused(method, sweeps, seed, str(e)))
     found: list[tuple[Json, measure.Call]] = [
-        (_entry(one, some), _call(method, one, sweeps.rate_hz)) for one in made
+        (
+            _entry(one, some),
+            _graph(method, (one.folder / measure.MODEL).read_bytes(), sweeps.rate_hz),
+        )
+        for one in made
     ]
     if method.name == "minirocket":
         from palpate_studies.peers import minirocket  # only here: scikit-learn
@@ -168,11 +171,6 @@ def _entry(one: Packed, some: Array) -> Json:
         "file_kb": measure.sizes(one.folder)[0] / 1000,
         "rss_mb": measure.memory(one.folder, some),
     }
-
-
-def _call(method: Method, one: Packed, rate_hz: float) -> measure.Call:
-    """A packed model without the checks of the box."""
-    return _graph(method, (one.folder / measure.MODEL).read_bytes(), rate_hz)
 
 
 def _refused(
@@ -198,9 +196,3 @@ def _graph(method: Method, graph: bytes, rate_hz: float) -> measure.Call:
     return lambda counts: run.run(
         None, {name: features.graph_input(method.input, counts, rate_hz)[None]}
     )
-
-
-def _alone(model: Model, counts: Array) -> Array:
-    """Logits [K] from raw counts [T, R, C]."""
-    logits: Array = model.logits(counts[None])[0]
-    return logits

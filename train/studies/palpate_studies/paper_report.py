@@ -9,7 +9,7 @@ import numpy as np
 
 from palpate_studies import TEMPLATES, comparison, differences
 from palpate_studies.paper_experiment import ATTACHMENTS, BLIND, HARD, HARD_BLIND, OWN
-from palpate_studies.paper_values import CNN, CONFUSION, FIGURES, FIVE, short_name
+from palpate_studies.paper_values import CNN, CONFUSION, FIGURES, FIVE
 from palpate_train.reports import confusion_plot, html, provenance
 from palpate_train.reports.formatting import estimate, exact_percent, seconds
 
@@ -129,7 +129,7 @@ def _match(rows: Mapping[Key, Row]) -> dict[str, Any]:
 def _numbers(rows: Mapping[Key, Row], part: str, methods: Sequence[str]) -> list[Row]:
     """Lines of a table of numbers, each with a name."""
     return [
-        {**rows[part, method], "name": short_name(method)}
+        {**rows[part, method], "name": method.removeprefix("palpate-")}
         for method in methods
         if (part, method) in rows
     ]

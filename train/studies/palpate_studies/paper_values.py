@@ -30,8 +30,3 @@ CONFUSION = np.array(
 )
 """Fig. 11, the CNN on T-REAL with a position left out: rows are the truth, in the order of
 skin.MATERIALS."""
-
-
-def short_name(method: str) -> str:
-    """A name for the rows of a table."""
-    return method.removeprefix("palpate-")

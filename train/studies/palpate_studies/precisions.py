@@ -36,11 +36,6 @@ class Packed:
     weights: int
     macs: int
 
-    @property
-    def name(self) -> str:
-        """A name that no other model of a chart has."""
-        return f"{self.method} {self.precision}"
-
 
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
     """The folder in the cache for the bundles of a method that was trained on these sweeps."""
