@@ -338,3 +338,41 @@ def test_what_cannot_be_fitted_is_named(x: object, y: object, why: str):
     """Before any training."""
     with pytest.raises(ValueError, match=why):
         small().fit(x, y)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("rate_hz", value) for value in (0, -1.0, np.nan, "fast")),
+        *(("mains_hz", value) for value in (0, np.nan)),
+        *(("steps", value) for value in (-1, 1.5)),
+        *(("grid", value) for value in (4, (-2, -2), (0, 4))),
+        *(("random_state", value) for value in (-3, 1.5, np.random.default_rng())),
+        *(("group", None), ("varies", None), ("size", "x"), ("reattached", "no")),
+    ],
+)
+def test_parameters_that_nothing_can_use_are_named(name: str, value: object):
+    """Before any training, as scikit-learn's estimators do."""
+    with pytest.raises(ValueError, match=name):
+        small(**{name: value}).fit(SWEEPS, LABELS)
+
+
+@pytest.mark.parametrize(
+    ("y", "groups", "why"),
+    [
+        (np.where(LABELS == "felt", None, "wood"), GROUPS, "y has values of several types"),
+        (LABELS, np.where(GROUPS == 1, None, "a"), "position has values of several types"),
+        (LABELS, np.stack([GROUPS, GROUPS], axis=1), r"position holds \[48, 2\]"),
+    ],
+)
+def test_labels_and_groups_without_an_order_are_named(y: np.ndarray, groups: np.ndarray, why: str):
+    """One value a sweep, all of one type."""
+    with pytest.raises(ValueError, match=why):
+        small().fit(SWEEPS, y, groups=groups)
+
+
+def test_a_word_and_an_array_are_parameters_too():
+    """One name in `varies`, and a grid of NumPy."""
+    one = small(varies="position", grid=np.array([2, 2])).fit(SWEEPS, LABELS, groups=GROUPS)
+    assert one.fit_.about["conditions"] == ["position"]
+    assert one.format_.shape == (2, 2)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import onnx
@@ -18,6 +18,7 @@ from sklearn.base import (
     TransformerMixin,
 )
 from sklearn.utils import check_random_state, column_or_1d
+from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import _check_sample_weight as check_sample_weight
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -71,6 +72,18 @@ class PalpateClassifier(
     and transforms, and is smaller than a bundle.
     """
 
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "rate_hz": [Interval(Real, 0, None, closed="neither")],
+        "grid": ["array-like", None],
+        "group": [str],
+        "reattached": ["boolean"],
+        "mains_hz": [Interval(Real, 0, None, closed="neither")],
+        "steps": [Interval(Integral, 0, None, closed="left")],
+        "size": [StrOptions(set(SIZES)), None],
+        "random_state": ["random_state"],
+        "varies": ["array-like", str],
+    }
+
     def __init__(
         self,
         rate_hz: float = 100.0,
@@ -112,8 +125,7 @@ class PalpateClassifier(
         bundle. Raises FormatError, which is a
         ValueError too.
         """
-        if self.size not in (None, *SIZES):
-            raise FormatError(f"size {self.size!r} is unknown; use one of {', '.join(SIZES)}")
+        self._validate_params()
         sweeps = X if isinstance(X, Dataset) else self._dataset(X, y, groups)
         if isinstance(X, Dataset):
             self.classes_ = np.array(sweeps.materials)
@@ -124,9 +136,8 @@ class PalpateClassifier(
             sweeps = replace(sweeps, groups=sweeps.groups | {WEIGHT: weights})
         use = SkinUse(self.reattached, float(self.mains_hz))
         size = SIZES[self.size] if self.size else UNLIMITED
-        settings = recipe.Settings(
-            self.steps, size=size, use=use, calibrate=False, varies=tuple(self.varies)
-        )
+        varies = (self.varies,) if isinstance(self.varies, str) else tuple(self.varies)
+        settings = recipe.Settings(self.steps, size=size, use=use, calibrate=False, varies=varies)
         seen = replace(sweeps.require_materials(), samples=held(sweeps.samples))
         self.fit_ = recipe.fit(seen, Run(self._seed()), settings)
         self.sweeps_, self.format_ = sweeps, sweeps.format
@@ -220,8 +231,8 @@ class PalpateClassifier(
     def _dataset(self, X: Any, y: Any, groups: Any) -> Dataset:
         """The sweeps of a fit, with their labels as numbers of `classes_`."""
         samples = self._counts(X, y)
+        self.classes_, numbers = _ranked("y", column_or_1d(y, warn=True))
         check_classification_targets(y)
-        self.classes_, numbers = np.unique(column_or_1d(y, warn=True), return_inverse=True)
         given = {} if groups is None else {self.group: groups}
         names = groups if isinstance(groups, Mapping) else getattr(groups, "columns", ())
         if len(names):
@@ -265,6 +276,17 @@ def _graph(fit: Fit) -> bytes:
 
 def _group(name: str, values: Any) -> Array:
     """Numbers as they are, recordings and all others as ranks."""
-    found: Array = column_or_1d(values)
+    found: Array = np.asarray(values).squeeze()
+    if found.ndim != 1:
+        raise FormatError(f"{name} holds {list(found.shape)} values; give one a sweep")
     plain = found.dtype.kind in "iuf" and name != "recording"
-    return found if plain else np.unique(found, return_inverse=True)[1]
+    return found if plain else _ranked(name, found)[1]
+
+
+def _ranked(name: str, values: Array) -> tuple[Array, Array]:
+    """The sorted values, and the rank of each. Raises FormatError if they have no order."""
+    try:
+        found, ranks = np.unique(values, return_inverse=True)
+    except TypeError as e:
+        raise FormatError(f"{name} has values of several types: {e}; give one type") from e
+    return found, ranks

@@ -73,8 +73,8 @@ def raw_counts(x: Any, grid: tuple[int, ...] | None = None) -> Array:
     if values.ndim == 2:
         values = values[:, None]
     if values.ndim == 3:
-        shape = grid or (values.shape[1], 1)
-        if int(np.prod(shape)) != values.shape[1]:
+        shape = (values.shape[1], 1) if grid is None else tuple(map(int, grid))
+        if min(shape) < 1 or int(np.prod(shape)) != values.shape[1]:
             raise FormatError(
                 f"X has {values.shape[1]} channels, but the grid {'x'.join(map(str, shape))} has "
                 f"{int(np.prod(shape))} places; set grid"
