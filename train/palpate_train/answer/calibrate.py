@@ -266,21 +266,30 @@ class CalibrationInputs:
         return weight.T, bias
 
 
+def fit_novelty(
+    given: CalibrationInputs,
+) -> tuple[Embedding, dict[str, LeftOut], StrangerLimits]:
+    """The embedding, the distances of left-out sweeps and materials by condition, and the limits of
+    a calibration. Raises FormatError as `embed`, and if there is only one group or no sweep to
+    judge by."""
+    embedding = in_two_views(given.whole, given.labels, given.fixed, given.beyond)
+    distances = left_out_in_turn(given, embedding)
+    return embedding, distances, limits(distances, junk=junk_distances(given, embedding))
+
+
 def fit_calibration(given: CalibrationInputs) -> Calibration:
     """The calibration that is fitted to these features. Raises FormatError as `embed`, and if there
     is only one group or no sweep to judge by."""
-    whole, labels = given.whole, given.labels
+    labels = given.labels
     named = {name: _named(given, values) for name, values in given.conditions.items()}
     values, *judged = _deciding(given, named)
     logits, numbers, class_mean_temperature = _prefix_logits(given, values, *judged)
     groups = values[numbers]
     temperatures = fit_early.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
-    embedding = in_two_views(whole, labels, given.fixed, given.beyond)
+    embedding, distances, beyond = fit_novelty(given)
     last = float(temperatures[-1])
     steps = fit_early.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
-    distances = left_out_in_turn(given, embedding)
-    beyond = limits(distances, junk=junk_distances(given, embedding))
     held = {}
     for name, (judging, answers) in named.items():
         known = distances[name].corrected()[0][judging] <= np.log(beyond.balanced)

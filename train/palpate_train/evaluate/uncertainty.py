@@ -6,7 +6,7 @@ the placements of the skin, since the errors of sweeps at one placement are corr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
-from palpate_train.answer.calibrate import Calibration
 from palpate_train.answer.embedding import auroc
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
@@ -30,8 +29,6 @@ BINS = 10
 """Bins of the reliability diagram and of the calibration error."""
 DRAWS = 500
 """Draws of the bootstrap."""
-Trained = tuple[Case, Calibration]
-"""One training and its calibration."""
 
 
 def left_out(
@@ -50,8 +47,7 @@ def left_out(
     """
     both, seen, new = train_and_test(train, test)
     (whole,) = cases([CaseTask(method, effort, SEED, seen, new)], both, where, log)
-    without = map(whole.without, range(len(both.materials)))
-    return unknown([(case, case.calibration()) for case in without], both.materials)
+    return unknown(map(whole.without, range(len(both.materials))), both.materials)
 
 
 def error(confidence: Array, right: Array) -> float:
@@ -78,15 +74,16 @@ def reliability(confidence: Array, right: Array) -> list[Json]:
     ]
 
 
-def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
+def unknown(without: Iterable[Case], materials: Sequence[str]) -> Json:
     """Detection of a material that was left out of training, by material and as their mean.
 
     Gives the AUROC of known test sweeps against those of the material, the share of known sweeps
     below the limit found in training, and of unknown sweeps that pass as known.
     """
     found: dict[str, Json] = {}
-    for case, done in without:
-        scores = done.embedding.novelty(case.new[:, -1]) / done.limits.balanced
+    for case in without:
+        embedding, limits = case.novelty()
+        scores = embedding.novelty(case.new[:, -1]) / limits.balanced
         found[materials[case.left_out]] = _detection(scores, case.known(), case.places)
     mean = {
         name: round(float(np.mean([row[name] for row in found.values()])), 4)

@@ -20,9 +20,16 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
-from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
+from palpate_train.answer.calibrate import (
+    Calibration,
+    CalibrationInputs,
+    fit_calibration,
+    fit_novelty,
+)
+from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
+from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.data.sets import Dataset, digest, join
 from palpate_train.evaluate import parallel
 from palpate_train.evaluate.evaluate import Where
@@ -89,11 +96,20 @@ class Case:
 
     def calibration(self) -> Calibration:
         """The calibration that is fitted on the trunk of this training."""
+        return fit_calibration(self.inputs())
+
+    def novelty(self) -> tuple[Embedding, StrangerLimits]:
+        """The embedding and the limits of this calibration, without its heads."""
+        embedding, _, limits = fit_novelty(self.inputs())
+        return embedding, limits
+
+    def inputs(self) -> CalibrationInputs:
+        """The inputs of its calibration."""
         copies = AugmentedCopies(
             self.copied, self.copied_labels, self.copied_source, self.copied_held
         )
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
-        given = CalibrationInputs(
+        return CalibrationInputs(
             self.seen,
             self.seen_labels,
             {str(number): values for number, values in enumerate(self.seen_groups)},
@@ -104,7 +120,6 @@ class Case:
             self.faulty,
             plan,
         )
-        return fit_calibration(given)
 
     def without(self, material: int) -> Case:
         """The same trunk with heads, embedding and limits that have not seen a material, from a

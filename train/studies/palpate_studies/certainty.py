@@ -77,7 +77,8 @@ def run(
 def figures(trained: Sequence[Case], materials: Sequence[str]) -> Json:
     """All figures. trained: first on all materials, then without each; with two materials none is
     left out."""
-    full, *without = [(case, case.calibration()) for case in trained]
+    whole, *without = trained
+    full = whole, whole.calibration()
     result = {"calibration": calibration(*full), "early": early(*full)}
     if without:
         result["unknown"] = uncertainty.unknown(without, materials)
