@@ -21,11 +21,12 @@ from palpate import __version__
 from palpate.core.clock import Clock
 from palpate.core.errors import ConfigError
 from palpate.core.log import log
+from palpate.core.text import printable
 
 TYPE = "_palpate._tcp.local."
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
-LISTEN_S = 2.0
-"""How long `found` waits for answers."""
+LISTEN_S, ASK_S = 2.0, 10.0
+"""How long `found` waits for names, and then asks for addresses: anybody may announce thousands."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -117,8 +118,8 @@ def _info(box: str, kind: str, hosts: list[str], port: int) -> Any:
 
 
 def found(clock: Clock, interfaces: list[str] | None = None) -> list[Reachable]:
-    """The announced ports on the networks of these addresses, None: of all. Takes LISTEN_S. Raises
-    ConfigError without zeroconf."""
+    """The announced ports on the networks of these addresses, None: of all. Takes LISTEN_S, and up
+    to ASK_S more. Raises ConfigError without zeroconf."""
     try:
         import zeroconf
     except ImportError as e:
@@ -132,10 +133,15 @@ def found(clock: Clock, interfaces: list[str] | None = None) -> list[Reachable]:
     with zeroconf.Zeroconf(interfaces or zeroconf.InterfaceChoice.All) as one:
         zeroconf.ServiceBrowser(one, TYPE, handlers=[heard])
         clock.sleep_until(clock.now_ns() + round(LISTEN_S * 1e9))
-        for name in sorted(names):
+        end_ns = clock.now_ns() + round(ASK_S * 1e9)
+        for name in sorted({*names}):
+            if clock.now_ns() > end_ns:
+                log.warning(f"too many names on the network; not all were asked in {ASK_S:g} s")
+                break
             info = one.get_service_info(TYPE, name, timeout=500)
             if info is None:  # it has just ended
                 continue
-            box, kind = name.partition(" ")[0], str(info.decoded_properties.get("kind"))
+            kind = printable(str(info.decoded_properties.get("kind")))
+            box = printable(name.partition(" ")[0])
             there += [Reachable(box, kind, h, info.port or 0) for h in info.parsed_addresses()]
     return sorted(there)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import socket
+from types import SimpleNamespace
+from typing import Self
 
 import pytest
 
 from palpate.core.clock import SystemClock
 from palpate.service import network
+from palpate.sim.rig import VirtualClock
 
 pytest.importorskip("zeroconf", reason="palpate[found] is not installed")
 LOOPBACK = ["127.0.0.1", "127.0.0.2"]
@@ -54,3 +57,38 @@ def test_the_id_is_stable_and_a_closed_box_says_nothing(monkeypatch):
         assert network.announce("tcp", host, 1503)() is None
     assert network.box_id() == network.box_id()
     assert len(network.box_id()) == 6
+
+
+def test_a_network_of_hostile_names(monkeypatch):
+    """Thousands of names without an address do not hold it up; texts of others cannot change the
+    terminal."""
+    clock, asked = VirtualClock(), []
+
+    class Network:
+        def __init__(self, interfaces: object) -> None:
+            pass
+
+        def __enter__(self) -> Self:
+            return self
+
+        def __exit__(self, *reason: object) -> None:
+            pass
+
+        def get_service_info(self, kind: str, name: str, timeout: int) -> object:
+            asked.append(name)
+            if name.startswith("0"):
+                text = {"kind": "page\x1b[2J"}
+                return SimpleNamespace(
+                    decoded_properties=text, port=1, parsed_addresses=lambda: ["10.0.0.1"]
+                )
+            clock.sleep_until(clock.now_ns() + 1_000_000 * timeout)
+            return None
+
+    def browse(one: Network, kind: str, handlers: list) -> None:
+        for name in ("0\x1b[31m page", *map("x{}".format, range(5000))):
+            handlers[0](one, kind, name, None)
+
+    monkeypatch.setattr("zeroconf.Zeroconf", Network)
+    monkeypatch.setattr("zeroconf.ServiceBrowser", browse)
+    assert network.found(clock) == [network.Reachable("0?[31m", "page?[2J", "10.0.0.1", 1)]
+    assert len(asked) < 30
