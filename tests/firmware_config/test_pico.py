@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import select
 import subprocess
 import sys
 import time
@@ -121,63 +119,6 @@ def test_counters_wrap() -> None:
         assert frames.seq[-1] & ((1 << EPOCH_BITS) - 1) >= 1 << 32
         assert (np.diff(frames.t_ns) > 0).all()
         assert (reader.sensor.counters.stale_frames, reader.sensor.counters.enumerations) == (0, 1)
-
-
-def ask(link: ReadoutLink, request: packets.Request) -> bytes:
-    """A reply; a busy machine may need several tries."""
-    end_s = time.monotonic() + LIMIT_S
-    while True:
-        try:
-            return link.request(request, 64)
-        except Exception:
-            if time.monotonic() > end_s:
-                raise
-
-
-def test_requests_in_the_middle_of_frames() -> None:
-    """Between requests and other bytes the stream stays whole; each request is answered."""
-    with pico.plugged_in(**FORM) as port:
-        fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
-        data, asked, end_s = b"", 0, time.monotonic() + LIMIT_S
-        os.write(fd, b"AT+CGMI\r\n\xff\x00\x05\x03")
-        while asked < 60 or len(packets.unpack(data).replies) < 60:
-            assert time.monotonic() < end_s
-            if select.select([fd], [], [], 0.01)[0]:
-                data += os.read(fd, 4096)
-            if asked < 60:
-                os.write(fd, (b"\x01\x03Q", b"\x02", b"\x00\x01")[asked % 3])
-                asked += 1
-        read = packets.unpack(data)
-        os.close(fd)
-    assert read.garbage == 0
-    assert [r.request for r in read.replies] == [1, 2, 1] * 20
-    _, _, _, stale = packets.follow(read.packets, packets.StreamPosition(0))
-    assert stale == 0
-    assert all(p.flags == 0 for p in read.packets)
-
-
-def test_stop_ends_the_stream() -> None:
-    """After STOP the packet under way is completed, and nothing follows; replies still come."""
-    with pico.plugged_in(**FORM) as port:
-        link = ReadoutLink(port, 115200, SystemClock())
-        ask(link, packets.Request.IDENTITY)
-        link.request(packets.Request.START, 0)
-        data, end_s = b"", time.monotonic() + LIMIT_S
-        while len(packets.unpack(data).packets) < 5:
-            assert time.monotonic() < end_s
-            data += link.read(65536, 1000)
-        link.request(packets.Request.STOP, 0)
-        data = data + link.read(65536, 100)
-        # read below: all before it was sent before it was asked
-        link.request(packets.Request.FORMAT, 0)
-        while not packets.unpack(data).replies:
-            assert time.monotonic() < end_s
-            data += link.read(65536, 1000)
-        read = packets.unpack(data)
-        assert (read.garbage, read.leftover) == (0, b"")
-        assert data.endswith(packets.pack_reply(packets.Request.FORMAT, read.replies[0].payload))
-        assert link.read(65536, 100) == b""
-        link.close()
 
 
 ALLOCATES = """

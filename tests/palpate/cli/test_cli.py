@@ -31,7 +31,6 @@ from palpate.core.devices import Devices
 from palpate.core.errors import BundleError, ConfigError, FormatError, LineError, SensorError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
-from palpate.io import packets
 from palpate.sim import skin
 from palpate.tools import pseudo_terminal
 from tests.factories import terminals, toy_bundle
@@ -516,16 +515,10 @@ def test_output_that_nobody_reads():
     assert "Traceback" not in done.stderr
 
 
-def test_skin_check_prints_a_verdict_for_each_part(monkeypatch, capsys):
-    """All ok without a bundle; a wrong CRC is one FAIL and exit code 1."""
+def test_skin_check_prints_a_verdict_for_each_part(capsys):
+    """All ok without a bundle."""
     words = ["skin", "check", "--sim", "skin", "--virtual"]
     assert main([*words, *with_sets("classifier.bundle=/nowhere")]) == 0
     told = capsys.readouterr()
     assert [line[:9] for line in told.out.splitlines()] == ["ok       "] * 12
     assert "frames" in told.err  # the duration is known before the first result
-    pack = packets.pack
-    monkeypatch.setattr(packets, "pack", lambda *args: pack(*args)[:-4] + bytes(4))
-    assert main(words) == 1
-    out = capsys.readouterr().out
-    assert "FAIL     crc" in out
-    assert "CRC-32" in out

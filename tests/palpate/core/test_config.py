@@ -273,14 +273,6 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
     assert names == [HEADER[int(pin)] for pin in numbers] == list(wired.values())
 
 
-@pytest.mark.parametrize("board", BOARDS)
-def test_a_dead_program_is_not_ready(board):
-    """READY is low from power-on; the page asks for strict_gpiod and the pull-down."""
-    assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
-    for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
-        assert words in _page(board)
-
-
 def test_one_cable_fits_both_boards_and_a_line_one_role(folder):
     """Raspberry Pi 4 and 5 agree on every value; both roles and sources are named."""
     four, five = map(_shipped, ("rpi4", "rpi5"))
