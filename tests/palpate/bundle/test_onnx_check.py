@@ -18,7 +18,7 @@ from palpate.core.errors import BundleError
 from palpate.deployment.sandbox import run_limited
 from palpate.inference.session import try_all
 from tests.campaigns import hostile_fuzz
-from tests.factories import hostile_models as hostile
+from tests.fuzz import hostile_models as hostile
 from tests.fuzz import mutated_models
 
 HOSTILE = hostile.every()
