@@ -321,6 +321,14 @@ class Candidates:
         few = (of.relations[:1], 1.0), (of.relations[: relations.SHORT], float(len(views)))
         return {"without magnitudes, with few scales": apart(*views, *few)}
 
+    def tuned(self, best: Heads) -> dict[str, Heads]:
+        """The best candidate of a single taxel with a discriminant of the spectrum: in one of a
+        thousand features of filters it has little weight."""
+        of = self.columns
+        if of.relations.size or not (len(of.bands) and of.kinds):
+            return {}
+        return {"with the spectrum beside": _beside(best, of.bands)}
+
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
         loads = self.columns.loads
@@ -330,14 +338,12 @@ class Candidates:
         return {"with loads beside": (*best, alone), "with loads in each": _with(best, loads)}
 
     def beside(self, best: Heads) -> dict[str, Heads]:
-        """Joins the best candidate unless it makes it worse: a discriminant of the slow waves,
-        which counts as much as all others together. On a skin that is put back the waves move from
-        taxel to taxel."""
+        """Joins the best candidate unless it makes it worse: a discriminant of the slow waves. On a
+        skin that is put back the waves move from taxel to taxel."""
         slow = self.columns.slow
         if self.copies or not len(slow):
             return {}
-        alone = HeadPart(tuple(slow.tolist()), best[0].copies, weight=sum(p.weight for p in best))
-        return {"with slow waves beside": (*best, alone)}
+        return {"with slow waves beside": _beside(best, slow)}
 
     def by_kind(self, shares: bool) -> Heads:
         """A discriminant of each kind of filters, zero-sum ones first: of their magnitudes, or of
@@ -352,6 +358,7 @@ STEPS: tuple[tuple[str, Callable[[PairedDifference], bool]], ...] = (
     ("extended", lambda found: found.better),
     ("related", lambda found: found.helps or found.better),
     ("steady", lambda found: found.carries),
+    ("tuned", lambda found: found.gains),
     ("loaded", lambda found: found.helps),
 )
 """The methods of Candidates that add to the choice so far, and when the best of theirs takes its
@@ -401,6 +408,12 @@ def _copied(parts: Heads, start: ScoredPlan) -> bool:
 
 def _without_copies(parts: Heads) -> Heads:
     return tuple(replace(p, copies=False) for p in parts)
+
+
+def _beside(parts: Heads, columns: Array) -> Heads:
+    """`parts`, and a discriminant of these features that counts as much as all others together."""
+    weight = sum(p.weight for p in parts)
+    return (*parts, HeadPart(tuple(columns.tolist()), parts[0].copies, weight=weight))
 
 
 def _with(parts: Heads, more: Array) -> Heads:

@@ -54,6 +54,11 @@ class PairedDifference:
         return bool(-self.won.sum() > max(_error(self.won), TINY))
 
     @property
+    def gains(self) -> bool:
+        """A lower loss, and an accuracy that is not lower."""
+        return bool(self.saved.sum() > 0 and self.won.sum() >= 0)
+
+    @property
     def helps(self) -> bool:
         """A lower loss by more than ERRORS standard errors, no group shows the opposite, and the
         accuracy is not worse. Here the loss decides, because a level shows in margins long before
