@@ -39,6 +39,8 @@ PERCENT: dict[str, Callable[..., str]] = {
     "interval": formatting.interval,
     "estimate": formatting.estimate,
 }
+CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Escapes, and marks of direction."""
 UNBROKEN = "\N{NO-BREAK SPACE}%"
 """Keeps number and sign on one line of a page."""
 FILTERS: dict[str, Callable[..., str]] = {
@@ -98,6 +100,7 @@ def _environment(folder: Path, escape: bool) -> Environment:
     made = Environment(
         loader=FileSystemLoader([folder, TEMPLATES]),
         autoescape=escape,
+        finalize=_without_controls,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -111,6 +114,13 @@ def _environment(folder: Path, escape: bool) -> Environment:
         "dark": Markup(DARK),
     }
     return made
+
+
+def _without_controls(value: Any) -> Any:
+    """A text from a file that may control the terminal that shows the page as text."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return CONTROLS.sub("?", value)
+    return value
 
 
 def _unbroken(show: Callable[..., str]) -> Callable[..., str]:

@@ -1,0 +1,15 @@
+"""Pages and their texts."""
+
+from pathlib import Path
+
+from palpate_train.reports import html
+
+
+def test_a_text_of_a_file_controls_no_terminal(tmp_path: Path):
+    """A page is also read as text: escapes and marks of direction are shown as ?. Line breaks, and
+    pictures of our own, stay."""
+    (tmp_path / "page.html.j2").write_text("{{ name }}|{{ share | percent }}|{{ own }}")
+    name = "a\x1b]0;b\x07\r\u202e<i>\nö"
+    own = html.picture("<svg>\x0c</svg>")
+    page = html.render("page.html.j2", tmp_path, name=name, share=0.5, own=own)
+    assert page == "a?]0;b???&lt;i&gt;\nö|50.0\u00a0%|<svg>\x0c</svg>"
