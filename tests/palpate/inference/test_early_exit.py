@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest, Thresholds
 from palpate.cli.main import main
 from palpate.client.answers import Answer
-from palpate.core.config import SweepConfig
+from palpate.core.config import ClassifierConfig, SweepConfig
 from palpate.core.types import SweepFormat, Verdict
+from palpate.inference import early_exit
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort
@@ -168,6 +170,20 @@ def test_otherwise_the_answer_is_the_usual_one(rigged, sets, least):
     assert summary([verdict]) == [("ok", "left", 1.0)]
     assert verdict.scores.tobytes() == want.scores.tobytes()
     assert (devices.DECIDED, True) not in levels(simulated, devices.DECIDED)
+
+
+def test_no_choice_widens_the_limits_of_early_answers(default_bundle, monkeypatch):
+    """A strict one narrows them as those of whole sweeps; a loose one leaves them."""
+    given, clock = mock.Mock(), rig.VirtualClock()
+    monkeypatch.setattr(early_exit, "EarlyDistances", given)
+    for name in ("balanced", "loose", "strict"):
+        EarlyExit(Classifier(default_bundle, clock, ClassifierConfig(strangers=name)))
+    balanced, loose, strict = (call.args[1] for call in given.call_args_list)
+    m = default_bundle.manifest
+    assert balanced == loose == m.early.limits
+    assert m.known.strict < m.known.balanced
+    share = m.known.strict / m.known.balanced
+    assert strict == pytest.approx([share * limit for limit in m.early.limits])
 
 
 def test_the_robot_stops_and_is_faster(rigged):
