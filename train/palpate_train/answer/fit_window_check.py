@@ -21,8 +21,6 @@ Array = NDArray[Any]
 MOST_REFUSED = 0.05
 """Largest share of sweeps that the box may refuse. Fewer are faults of their recordings, and the
 usual limits stay; more are how this skin is."""
-KEPT = 0.99
-"""Share of sweeps like those of the set that fitted limits keep; all if there are few."""
 Limits = TypeVar("Limits", bound=WindowLimits)
 
 
@@ -53,7 +51,7 @@ def fitted(limits: Limits, parts: Sequence[Dataset], tare: Array) -> Limits:
     if not passed:
         return limits
     full, silent = (
-        embedding.limit(np.array(values, float), KEPT)
+        embedding.limit(np.array(values, float))
         for values in ([one.full for one in passed], [one.silent for one in passed])
     )
     return replace(
