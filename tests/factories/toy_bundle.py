@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 from palpate.answer.contact import ContactPositions
+from palpate.answer.displacement import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
 from palpate.answer.pipeline import Context, Stage
-from palpate.answer.unknown import DisplacementRule, Known
+from palpate.answer.unknown import Known
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest, Thresholds
 from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat

@@ -19,12 +19,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context, Displacement, Refusal
+from palpate.answer.pipeline import Context, Displacement
 from palpate.answer.window import Window
 from palpate.core.errors import BundleError
 from palpate.core.schema import LEAST, Within, check
-from palpate.core.status import Reason, Remark
-from palpate.core.types import Status, normal
+from palpate.core.types import normal
 
 LEAST_PART = 0.25
 """A direction with a smaller share of the distance is left out: it changes the distance by less
@@ -171,18 +170,3 @@ class LocateContact:
         context.displacement = displacement(
             context.mean, context.tare, self._contact, self._positions
         )
-
-
-class WithinReach:
-    """Refuses a contact that is displaced further than any training copy, `farthest_mm`."""
-
-    def __init__(self, farthest_mm: float) -> None:
-        self._farthest_mm = farthest_mm
-
-    def apply(self, context: Context) -> Refusal | None:
-        """Refuse a sweep that is too far off."""
-        if context.displacement.mm > self._farthest_mm:
-            return Refusal(
-                Status.UNKNOWN, Remark(Reason.TOO_FAR, {"farthest_mm": self._farthest_mm})
-            )
-        return None

@@ -7,9 +7,9 @@ the stages of a bundle and states their order.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from palpate.answer.window import Window
 from palpate.core.status import Remark
 from palpate.core.types import Status, Sweep
+
+if TYPE_CHECKING:
+    from palpate.answer.objects import EnrolledLabels
 
 Array = NDArray[Any]
 
@@ -108,6 +111,19 @@ class Context:
         if self._window is None or self._window.taxels is not self.taxels:
             self._window = Window(self.taxels)
         return self._window
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Data that a rule may need with its parameters. labels: [K]. window: frames of a whole window.
+    enrolled: for the label of the answer. beyond: see Disturbances. height: of the pattern in a
+    sweep; None if slides on this skin cannot be measured."""
+
+    labels: Sequence[str]
+    window: int
+    enrolled: EnrolledLabels
+    beyond: Callable[[str, Mapping[str, float]], float]
+    height: Callable[[Context], float] | None
 
 
 class Stage(Protocol):

@@ -10,6 +10,7 @@ for the sweeps of a set.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -175,7 +176,7 @@ class SlideMeter:
         """Heights [2, 2, V + 1] of the sums for slides towards higher and lower numbers, along rows
         and columns, at each speed and without a lag."""
         size = np.abs(spectra)
-        # the root of a product is the product of roots, of which there are fewer
+        # the root of a product is the product of roots, and there are fewer roots than products
         rooted = spectra * (1 / np.sqrt(np.maximum(size, TINY)))
         first, second = rooted.take(self._pairs, 0)
         sums = self._of_pair @ (first * second.conj()).view(np.float32)
@@ -286,12 +287,12 @@ class ShowsPattern:
     gets an early answer, without this rule 20, and known sweeps need 0.38 instead of 0.30 of the
     window."""
 
-    def __init__(self, least: float, measured: MeasureSlide) -> None:
-        self._least, self._measured = least, measured
+    def __init__(self, least: float, height: Callable[[Context], float]) -> None:
+        self._least, self._height = least, height
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse a sweep without a pattern. Bridged taxels move with their neighbours, which hides
         the pattern."""
-        if context.degraded is None and self._measured.height(context) < self._least:
+        if context.degraded is None and self._height(context) < self._least:
             return Refusal(Status.NO_SLIDE, Remark(Reason.NO_PATTERN))
         return None

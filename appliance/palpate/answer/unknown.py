@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.displacement import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
@@ -68,26 +69,6 @@ class Known:
         """The limit of this name as a multiple of the balanced one. Limits of displaced and of
         unfinished sweeps are balanced, and multiplied by it."""
         return float(getattr(self, strangers)) / self.balanced
-
-
-@dataclass(frozen=True, slots=True)
-class DisplacementRule:
-    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
-    number out of range.
-
-    limit: as Known.balanced, for the distances of displaced sweeps. temperature: divisor of logits
-    that are calibrated for sweeps without displacement. unsure: least probability for status ok;
-    above 1 a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep
-    gets no label, because no training copy is displaced as far; None if unknown.
-    """
-
-    limit: Positive
-    temperature: Positive
-    unsure: Positive
-    farthest_mm: Positive | None = None
-
-    def __post_init__(self) -> None:
-        check(self, "displacement")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

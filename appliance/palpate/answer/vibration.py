@@ -7,15 +7,13 @@ measure does not change with the gain of the skin. Pure functions of raw counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.disturbance import Disturbances
-from palpate.answer.objects import EnrolledLabels
-from palpate.answer.pipeline import Context, Refusal
+from palpate.answer.pipeline import Context, Given, Refusal, Stage
+from palpate.answer.slide import ShowsPattern
 from palpate.answer.window import TINY, Counts, Window, ones
 from palpate.core.schema import Positive, check
 from palpate.core.status import Reason, Remark
@@ -49,6 +47,13 @@ class SlideLimits:
         least = self.least[label]
         return [part for part, found in enumerate(vibrations.tolist(), 1) if found < least]
 
+    def judges(self, given: Given) -> list[Stage]:
+        """Whether a pattern shows, and whether the finger vibrates."""
+        vibrates = Vibrates(self, given)
+        if self.pattern is None or given.height is None:
+            return [vibrates]
+        return [ShowsPattern(self.pattern, given.height), vibrates]
+
 
 def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
     """Natural logarithm of vibration over load in each part, float64 [parts].
@@ -70,36 +75,24 @@ def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
 
 class Vibrates:
     """Refuses a sweep in which the finger rests in a part of the window so far, where a slide over
-    the label of the answer vibrates more.
+    the label of the answer vibrates more. A load beyond that of training counts as that of
+    training: vibrations grow less than it."""
 
-    labels: [K]. window: frames of a whole window. enrolled: rule for the label of the answer. A
-    load beyond that of training counts as that of training: vibrations grow less than it.
-    """
-
-    def __init__(
-        self,
-        limits: SlideLimits,
-        labels: Sequence[str],
-        window: int,
-        enrolled: EnrolledLabels,
-        disturbances: Disturbances | None,
-    ) -> None:
-        self._limits, self._labels, self._window = limits, labels, window
-        self._enrolled, self._disturbances = enrolled, disturbances
+    def __init__(self, limits: SlideLimits, given: Given) -> None:
+        self._limits, self._given = limits, given
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse a sweep with a rest."""
-        parts = PARTS * len(context.taxels) // self._window
+        parts = PARTS * len(context.taxels) // self._given.window
         if context.whole and not self._limits.whole:
             return None
         if not parts or len(context.taxels) < 2 * parts:
             return None
-        allowed = self._disturbances
-        beyond = allowed.beyond("load", context.disturbed) if allowed else 0.0
-        label = int(self._enrolled.decided(context.probabilities).argmax())
+        beyond = self._given.beyond("load", context.disturbed)
+        label = int(self._given.enrolled.decided(context.probabilities).argmax())
         found = self._limits.resting(vibration(context.window, context.tare, parts) + beyond, label)
         if not found:
             return None
-        where, name = " ".join(map(str, found)), self._labels[label]
+        where, name = " ".join(map(str, found)), self._given.labels[label]
         numbers = {"parts": where, "of": PARTS, "label": name}
         return Refusal(Status.NO_SLIDE, Remark(Reason.RESTS, numbers))

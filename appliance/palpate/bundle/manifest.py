@@ -12,13 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer import features
-from palpate.answer.contact import ContactPositions
-from palpate.answer.disturbance import Disturbances
-from palpate.answer.early import Early
-from palpate.answer.slide import SpeedRange
-from palpate.answer.taxels import Bridging
-from palpate.answer.unknown import UNSURE, DisplacementRule, Known
-from palpate.answer.vibration import SlideLimits
+from palpate.answer.rules import Rules
+from palpate.answer.unknown import UNSURE
 from palpate.answer.window_check import WindowLimits
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.names import LABEL, MOST_SHOWN, can_be_shown
@@ -47,26 +42,18 @@ class Thresholds(WindowLimits):
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
-    """The manifest of a bundle. Raises BundleError for values out of range.
+class Manifest(Rules):
+    """The manifest of a bundle, with its rules. Raises BundleError for values out of range.
 
     input: "raw" or a feature set.
     files: name -> sha256 and size.
     figures: results by evaluation protocol.
     made: commit, seed and machine of the export.
-    early, known: rules for early answers and unknown materials; None if not supported.
-    contact: contact positions in training; None if unknown.
-    displacement: rule for contacts elsewhere; None if not supported.
     runtime: least version of the program that can run the bundle.
     counter: increases with each signed bundle, so that an older bundle cannot be installed
         unnoticed; 0 for a bundle that was never signed.
     unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
         unknown.
-    speeds: range of the measured speeds in training; None if unknown.
-    bridging: broken taxels that the model tolerates; None if that was not measured.
-    sliding: what tells a slide from a rest; None if unknown.
-    disturbances: allowances for noise, load, speed, lost frames and hum; None if they were not
-        measured.
     displays: names of materials for people, in any language, by label; {} if labels are shown.
     """
 
@@ -79,17 +66,9 @@ class Manifest:
     files: dict[str, dict[str, Any]]
     figures: dict[str, Any] = field(default_factory=dict)
     made: dict[str, Any] = field(default_factory=dict)
-    early: Early | None = None
-    known: Known | None = None
-    contact: ContactPositions | None = None
-    displacement: DisplacementRule | None = None
     runtime: str = "0.0.0"
     counter: int = 0
     unloaded: tuple[float, ...] = ()
-    speeds: SpeedRange | None = None
-    bridging: Bridging | None = None
-    sliding: SlideLimits | None = None
-    disturbances: Disturbances | None = None
     displays: dict[str, str] = field(default_factory=dict)
     schema: int = SCHEMA
 

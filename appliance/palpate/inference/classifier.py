@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer import features
-from palpate.answer.contact import LocateContact, WithinReach
-from palpate.answer.disturbance import MeasureDisturbances, WasTried
+from palpate.answer.contact import LocateContact
+from palpate.answer.disturbance import Disturbances, MeasureDisturbances, WasTried
 from palpate.answer.hum import HumFilter
 from palpate.answer.objects import (
     Certain,
@@ -25,11 +25,10 @@ from palpate.answer.objects import (
     ObjectSweeps,
     softmax,
 )
-from palpate.answer.pipeline import Context, Stage, run
-from palpate.answer.slide import MeasureSlide, ShowsPattern
+from palpate.answer.pipeline import Context, Given, Stage, run
+from palpate.answer.slide import MeasureSlide
 from palpate.answer.taxels import TaxelWatch
 from palpate.answer.unknown import ClassDistances, KnownMaterial
-from palpate.answer.vibration import Vibrates
 from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from palpate.bundle.manifest import MEANS
@@ -142,17 +141,12 @@ class Classifier(Observer):
 
     def _judges(self) -> list[Stage]:
         """The stages that look at the network's answer."""
-        m, stages = self.bundle.manifest, list[Stage]([GivesNumbers()])
-        rule, enrolled = m.displacement, self._objects.enrolled
-        if rule and rule.farthest_mm:
-            stages.append(WithinReach(rule.farthest_mm))
-        if m.sliding and m.sliding.pattern and self._slide and self._slide.able:
-            stages.append(ShowsPattern(m.sliding.pattern, self._slide))
-        if m.sliding:
-            stages.append(Vibrates(m.sliding, m.labels, m.format.window, enrolled, m.disturbances))
-        least = self.settings.min_probability
-        displaced = max(least, rule.unsure if rule else 0.0)
-        return [*stages, self._objects, Certain(least, displaced)]
+        m, least = self.bundle.manifest, self.settings.min_probability
+        beyond = (m.disturbances or Disturbances()).beyond
+        height = self._slide.height if self._slide and self._slide.able else None
+        given = Given(m.labels, m.format.window, self._objects.enrolled, beyond, height)
+        displaced = max(least, m.displacement.unsure if m.displacement else 0.0)
+        return [GivesNumbers(), *m.judges(given), self._objects, Certain(least, displaced)]
 
     @property
     def rule(self) -> dict[str, Any]:

@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.displacement import DisplacementRule
 from palpate.answer.early import Early
 from palpate.answer.objects import LEAST_PROBABILITY, softmax
 from palpate.answer.unknown import (
     UNSURE,
     Classes,
-    DisplacementRule,
     Known,
     shaped_distances,
 )

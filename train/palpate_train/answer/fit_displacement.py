@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.contact import displacement
+from palpate.answer.displacement import DisplacementRule
 from palpate.answer.objects import softmax
-from palpate.answer.unknown import Classes, DisplacedClasses, DisplacementRule
+from palpate.answer.unknown import Classes, DisplacedClasses
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import Embedding, embed, limit
@@ -164,3 +165,6 @@ def without(bundle: Bundle) -> Bundle:
     """The bundle that judges displaced contacts as it judges others."""
     classes = bundle.classes and replace(bundle.classes, displaced=None)
     return replace(bundle, manifest=replace(bundle.manifest, displacement=None), classes=classes)
+
+
+RULES = {"displacement": ("a rule for displaced contacts", without, True, limited)}

@@ -278,3 +278,9 @@ def without(bundle: Bundle) -> Bundle:
         manifest=replace(bundle.manifest, disturbances=replace(allowed, allowances=())),
         classes=replace(classes, changes=classes.changes[:0]),
     )
+
+
+RULES = {
+    "disturbance": ("allowances for disturbances", without),
+    "hum": ("hum removal", fit_hum.without),
+}

@@ -265,3 +265,6 @@ def without(bundle: Bundle) -> Bundle:
     """The bundle that answers whole sweeps only."""
     classes = bundle.classes and replace(bundle.classes, early=None)
     return replace(bundle, manifest=replace(bundle.manifest, early=None), classes=classes)
+
+
+RULES = {"early": ("early answers", without, False)}

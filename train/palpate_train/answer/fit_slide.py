@@ -114,3 +114,9 @@ def _limits(bundle: Bundle, **changed: Any) -> Bundle:
     limits = replace(bundle.manifest.sliding, **changed)
     kept = limits if limits.least or limits.pattern else None
     return replace(bundle, manifest=replace(bundle.manifest, sliding=kept))
+
+
+RULES = {
+    "vibration": ("a least vibration of slides", without_vibration),
+    "slide": ("a least pattern of slides", without_pattern, True, limited),
+}

@@ -354,3 +354,6 @@ def text(manifest: Manifest) -> str:
 def without(bundle: Bundle) -> Bundle:
     """The bundle that bridges no broken taxel: it refuses them."""
     return replace(bundle, manifest=replace(bundle.manifest, bridging=None))
+
+
+RULES = {"taxels": ("bridging of broken taxels", without)}

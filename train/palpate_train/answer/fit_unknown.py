@@ -276,3 +276,6 @@ def without(bundle: Bundle) -> Bundle:
         early=m.early and replace(m.early, limits=()),
     )
     return replace(bundle, manifest=manifest, classes=None)
+
+
+RULES = {"unknown": ("detection of unknown materials", without, False)}

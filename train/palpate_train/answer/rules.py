@@ -1,26 +1,21 @@
-"""The optional rules of the answer by name, in the order in which they are left out on trial.
+"""The optional rules of the answer by name, in the order of palpate.answer.rules, in which they are
+left out on trial.
 
 Export, score and card use this table. A bundle holds the rules that pay on the user's own sweeps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, get_args, get_type_hints
 
+from palpate.answer.rules import Rules
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.errors import FormatError
-from palpate_train.answer import (
-    fit_displacement,
-    fit_disturbance,
-    fit_early,
-    fit_hum,
-    fit_slide,
-    fit_taxels,
-    fit_unknown,
-)
 from palpate_train.data.sets import Dataset
 
 FIGURES = "rules"
@@ -30,28 +25,25 @@ FIGURES = "rules"
 @dataclass(frozen=True)
 class Rule:
     """A rule that a bundle may lack. what: for people. without: makes a bundle without it; the same
-    bundle if it has none. limited: a manifest with its limits, from the counts of training sweeps.
-    tried: whether recordings can show that it is not needed; no recording shows a material that was
-    not taught, and an early answer saves time alone."""
+    bundle if it has none. tried: whether recordings can show that it is not needed; no recording
+    shows a material that was not taught, and an early answer saves time alone. limited: a manifest
+    with its limits, from the counts of training sweeps."""
 
     what: str
     without: Callable[[Bundle], Bundle]
-    limited: Callable[[Manifest, Dataset], Manifest] = lambda manifest, train: manifest
     tried: bool = True
+    limited: Callable[[Manifest, Dataset], Manifest] = lambda manifest, train: manifest
 
 
-RULES: Mapping[str, Rule] = {
-    "early": Rule("early answers", fit_early.without, tried=False),
-    "disturbance": Rule("allowances for disturbances", fit_disturbance.without),
-    "displacement": Rule(
-        "a rule for displaced contacts", fit_displacement.without, fit_displacement.limited
-    ),
-    "vibration": Rule("a least vibration of slides", fit_slide.without_vibration),
-    "slide": Rule("a least pattern of slides", fit_slide.without_pattern, fit_slide.limited),
-    "hum": Rule("hum removal", fit_hum.without),
-    "taxels": Rule("bridging of broken taxels", fit_taxels.without),
-    "unknown": Rule("detection of unknown materials", fit_unknown.without, tried=False),
-}
+def _twins() -> Iterator[Mapping[str, tuple[Any, ...]]]:
+    """The `RULES` of the twin of each module that has parameters of the box."""
+    for hint in get_type_hints(Rules).values():
+        name = f"{__package__}.fit_{get_args(hint)[0].__module__.rpartition('.')[2]}"
+        if find_spec(name):
+            yield getattr(import_module(name), "RULES", {})
+
+
+RULES = {name: Rule(*about) for twin in _twins() for name, about in twin.items()}
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from palpate.answer.displacement import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
 from palpate.answer.objects import softmax
-from palpate.answer.unknown import Classes, DisplacementRule, Known, shaped_distances
+from palpate.answer.unknown import Classes, Known, shaped_distances
 from palpate.bundle import arrays, bundle
 from palpate.core.errors import BundleError
 from palpate_train.answer.fit_contact import Contacts
