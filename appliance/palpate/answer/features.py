@@ -113,26 +113,22 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     return normalised.ravel()
 
 
-Kinds = Mapping[str, Callable[[NDArray[Any], float], Array]]
-KINDS: Kinds = MappingProxyType({"L": l_features, "H": h_features})
+KINDS: Mapping[str, Callable[[NDArray[Any], float], Array]] = MappingProxyType(
+    {"L": l_features, "H": h_features}
+)
 """Feature sets by their names in a bundle's manifest."""
 
 
-def compute(
-    kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS
-) -> NDArray[np.float32]:
-    """Feature set `kind` (of `kinds`) of raw counts at `rate_hz`: float32 [n]. Raises
-    FormatError."""
-    if kind not in kinds:
-        raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(kinds)}")
-    return kinds[kind](taxels, rate_hz).astype(np.float32)
+def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float32]:
+    """Feature set `kind` of raw counts at `rate_hz`: float32 [n]. Raises FormatError."""
+    if kind not in KINDS:
+        raise FormatError(f"feature set {kind!r} is unknown; use one of {', '.join(KINDS)}")
+    return KINDS[kind](taxels, rate_hz).astype(np.float32)
 
 
-def graph_input(
-    kind: str, taxels: NDArray[Any], rate_hz: float, kinds: Kinds = KINDS
-) -> NDArray[Any]:
+def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
     """Input of a graph of input `kind` for raw counts: the counts if "raw", otherwise `compute`."""
-    return taxels if kind == "raw" else compute(kind, taxels, rate_hz, kinds)
+    return taxels if kind == "raw" else compute(kind, taxels, rate_hz)
 
 
 def _clean(bins: float) -> float:

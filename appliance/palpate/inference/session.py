@@ -101,9 +101,7 @@ def try_all(bundle: Bundle) -> None:
     rank = None if bundle.classes is None else bundle.classes.means.shape[1]
     patterns = check.expected(m, len(bundle.enrolled), rank)
     for window in bundle.golden:
-        numbers = (
-            window if m.input == "raw" else features.compute(m.input, window, m.format.rate_hz)
-        )
+        numbers = features.graph_input(m.input, window, m.format.rate_hz)
         begun_s = time.process_time()
         values = run(opened, names, {opened.get_inputs()[0].name: numbers[None]})
         took_s = time.process_time() - begun_s
