@@ -167,3 +167,19 @@ def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixe
         Protocol(f"random:{folds}").folds(sweeps, seed), theirs, strict=True
     ):
         assert test.tolist() == wanted.tolist()
+
+
+@pytest.mark.parametrize("varies", [("speed",), ("speed", "force"), ()])
+def test_named_groups_alone_are_left_out_with_their_outermost_values(varies: tuple[str, ...]):
+    """Each value of them is judged once, by sweeps of the others; without a name, of all groups."""
+    n, speeds = 60, [10, 20, 50, 100, 150]
+    grid = {
+        "speed": [speeds[i // 2 % 5] for i in range(n)],
+        "force": [i // 10 % 3 for i in range(n)],
+    }
+    sweeps = a_set([i % 2 for i in range(n)], **grid)
+    parts = inner_parts(sweeps, varies)
+    assert {part.group for part in parts} == set(varies or grid)
+    for name in {part.group for part in parts}:
+        out = [np.unique(sweeps.group(name)[p.out]) for p in parts if p.group == name]
+        assert sorted(np.concatenate(out)) == sorted(set(grid[name]))

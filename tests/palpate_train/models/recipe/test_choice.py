@@ -542,3 +542,14 @@ def test_a_spectrum_gains_with_the_loss_and_never_against_labels(
     parts = np.arange(90) % 3
     found = choice.PairedDifference(np.full(90, won / 90), np.full(90, saved / 90), parts, [])
     assert found.gains is gains
+
+
+def test_a_tie_takes_the_larger_sum():
+    """Where all held-out labels are right either way, slow waves join."""
+    given, parts = known()
+    clear = 20 * np.eye(3)[given.labels] + np.random.default_rng(6).standard_normal((240, 3))
+    x = np.hstack([clear, clear]).astype(np.float32)
+    at = HeldOutScores([replace(given, features=x, of_copies=lambda: x)] * 3, parts, 3)
+    offered = candidates([[0, 1, 2]], [0, 1, 2], [0, 1, 2], slow=[3, 4, 5])
+    assert at.wrong(at.score(offered.usual())) == 0
+    assert {3, 4, 5} <= set(choice.choose(at, offered, print).plan.columns().tolist())

@@ -56,7 +56,7 @@ class PairedDifference:
     @property
     def gains(self) -> bool:
         """A lower loss, and an accuracy that is not lower."""
-        return bool(self.saved.sum() > 0 and self.won.sum() >= 0)
+        return bool(self.saved.sum() > 0 and self.won.sum() > -TINY)
 
     @property
     def helps(self) -> bool:
