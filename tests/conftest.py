@@ -39,6 +39,9 @@ LIMIT_S = 300
 """Longest time of a test, as in pyproject.toml. One takes seconds, on a busy machine a minute."""
 BUILDING_S = 3600
 """The same where the first test builds a Debian or a virtual machine."""
+THOROUGH_S = 1200
+"""The same of a thorough test, which may fit a model: minutes, and several times as long on a busy
+machine."""
 GRACE_S = 60
 
 with suppress(ModuleNotFoundError):  # a board has no Hypothesis
@@ -65,10 +68,12 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give the tests in Debians and emulated machines the time to build them."""
+    """Give thorough tests their time, and those in Debians and emulated machines to build them."""
     for item in items:
         if item.path.relative_to(ROOT).parts[1] in ("rig", "systemd", "campaigns"):
             item.add_marker(pytest.mark.timeout(BUILDING_S))
+        elif item.get_closest_marker("thorough") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(THOROUGH_S))
 
 
 @pytest.fixture
