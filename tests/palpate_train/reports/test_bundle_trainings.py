@@ -11,6 +11,7 @@ from palpate_train.cli.main import main
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
+from palpate_train.models import methods
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.reports import bundle_trainings
@@ -54,7 +55,8 @@ def test_what_twice_as_many_sweeps_bring(errors: tuple[float, ...], gain: float)
 @pytest.mark.slow
 @pytest.mark.thorough  # fits again for each material
 def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
-    """For each material the share with a known label, and known sweeps that are kept."""
+    """For each material the share with a known label, and known sweeps that are kept. The same
+    training gives the last point of the curve."""
     train, test = tones(10), tones(4, noise=1.5)
     found = bundle_trainings.run({"chosen": "filters"}, train, test, where(tmp_path), NOTHING)
     assert set(found["left_out"]["materials"]) == {"a", "b", "c"}
@@ -62,6 +64,8 @@ def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path
         assert (m["known"], m["unknown"]) == (16, 8)
         assert 0 <= m["false_known"] <= 1
     assert found["trained"]["method"] == "palpate"
+    args = where(tmp_path), NOTHING, methods.FULL_EFFORT
+    assert found["curve"] == bundle_trainings.curve("palpate", train, test, *args)
 
 
 def test_curves_need_a_method_and_the_form_of_the_bundle(tmp_path: Path):

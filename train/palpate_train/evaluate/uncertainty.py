@@ -31,23 +31,25 @@ DRAWS = 500
 """Draws of the bootstrap."""
 
 
-def left_out(
+def trained(
     train: Dataset,
     test: Dataset,
     method: str,
     where: Where,
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
-) -> Json:
-    """`unknown` of the sweeps of `test` if each material in turn is left out of heads, embedding
-    and limits. One training suffices: its features are chosen with all materials.
-
-    Raises FormatError if the sets do not fit together, or if the method has no features to judge
-    novelty by.
-    """
+) -> Case:
+    """One training on all of `train`, with the sweeps of `test`. Raises FormatError if the sets do
+    not fit together, or if the method has no features to judge novelty by."""
     both, seen, new = train_and_test(train, test)
-    (whole,) = cases([CaseTask(method, effort, SEED, seen, new)], both, where, log)
-    return unknown(map(whole.without, range(len(both.materials))), both.materials)
+    return cases([CaseTask(method, effort, SEED, seen, new)], both, where, log)[0]
+
+
+def left_out(whole: Case, materials: Sequence[str]) -> Json:
+    """`unknown` of the test sweeps if each material in turn is left out of heads, embedding and
+    limits of a training on all. One training suffices: its features are chosen with all
+    materials."""
+    return unknown(map(whole.without, range(len(materials))), materials)
 
 
 def error(confidence: Array, right: Array) -> float:

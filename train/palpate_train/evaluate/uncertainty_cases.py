@@ -11,7 +11,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ class Case:
     copied_held [M]; see AugmentedCopies. faulty: bool [N] of the seen sweeps; see
     CalibrationInputs. new, labels,
     places: features of the test sweeps, the set's labels, and the placements of the skin. plan:
-    HeadPlan.json as text.
+    HeadPlan.json as text. logits: float32 [n, K] of the test sweeps by the training itself.
     """
 
     left_out: int
@@ -88,6 +88,7 @@ class Case:
     places: Array
     faulty: Array
     plan: str = ""
+    logits: Array = field(default_factory=lambda: np.empty((0, 0), np.float32))
 
     def known(self) -> Array:
         """bool [n], the test sweeps of materials that were trained."""
@@ -168,7 +169,8 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     if task.left_out != NONE_LEFT_OUT:
         others = tuple(m for k, m in enumerate(part.materials) if k != task.left_out)
         part = replace(part, labels=_closed(part.labels, task.left_out), materials=others)
-    made: Fit = method.train(part, part.samples, task.seed).fit  # type: ignore[attr-defined]
+    trained = method.train(part, part.samples, task.seed)
+    made: Fit = trained.fit  # type: ignore[attr-defined]
     given = calibration_inputs(made, early=True, displaced=True)
     copies = given.copied
     places = sweeps.groups.get("position", sweeps.group("recording"))
@@ -189,6 +191,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         places[task.test],
         given.faulty,
         json.dumps(given.plan.json()) if given.plan else "",
+        trained.logits(sweeps.samples[task.test]),
     )
 
 

@@ -7,7 +7,7 @@ of `evaluate` are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,9 @@ from palpate_train.data import sets
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, uncertainty
-from palpate_train.evaluate.evaluate import Plan, Where
+from palpate_train.evaluate.evaluate import Plan, Result, Where
+from palpate_train.evaluate.fold import Fold
+from palpate_train.evaluate.uncertainty_cases import Case
 from palpate_train.models import methods
 from palpate_train.models.methods import SHIPPED, Effort
 from palpate_train.models.recipe.fitted import Fit
@@ -58,14 +60,16 @@ def run(
             "effort": effort.share,
         }
     }
-    figures["curve"] = curve(method, train, test, where, log, effort)
-    if len(figures["curve"]) > 2:
-        figures["doubled"] = doubled(figures["curve"])
+    whole: Case | None = None
     if len(train.materials) > 2:
         try:
-            figures["left_out"] = uncertainty.left_out(train, test, method, where, log, effort)
+            whole = uncertainty.trained(train, test, method, where, log, effort)
+            figures["left_out"] = uncertainty.left_out(whole, train.materials)
         except FormatError as e:  # a method that knows no novelty
             figures["why_not"] = str(e)
+    figures["curve"] = curve(method, train, test, where, log, effort, whole)
+    if len(figures["curve"]) > 2:
+        figures["doubled"] = doubled(figures["curve"])
     return figures
 
 
@@ -82,10 +86,17 @@ def whole(fit: Fit) -> Dataset:
 
 
 def curve(
-    method: str, train: Dataset, test: Dataset, where: Where, log: Log, effort: Effort
+    method: str,
+    train: Dataset,
+    test: Dataset,
+    where: Where,
+    log: Log,
+    effort: Effort,
+    whole: Case | None = None,
 ) -> list[Json]:
     """Accuracy on `test` after training on some sweeps of each material: `each`, `share`, `low`,
-    `high`, `n`. The last point is of all sweeps of `train`, and its `each` is the mean."""
+    `high`, `n`. The last point is of all sweeps of `train`, by the training `whole` if there is
+    one, and its `each` is the mean."""
     both = sets.join([train, test])
     counts = np.bincount(train.labels, minlength=len(train.materials))
     points = []
@@ -93,8 +104,12 @@ def curve(
     progress = Progress(len(sizes), log)
     for each in sizes:
         progress.begin(f"learning curve, {each or round(counts.mean())} sweeps of each material")
-        plan = Plan((method,), (SPLIT,), (1,), effort=effort, each=each)
-        for result in evaluate.evaluate(both, plan, where, log):
+        plan = Plan((method,), (SPLIT,), (uncertainty.SEED,), effort=effort, each=each)
+        results: Iterable[Result] = evaluate.evaluate(both, plan, where, log)
+        if whole and not each:
+            fold = Fold(len(train) + np.arange(len(test)), whole.logits, 0.0, 0.0, 0.0)
+            results = [Result(method, SPLIT, False, uncertainty.SEED, both, [fold], {})]
+        for result in results:
             if result.refused:
                 continue  # too few sweeps for it; with more there is a point
             found = result.json()
