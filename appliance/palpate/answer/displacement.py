@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from palpate.answer.pipeline import Context, Given, Refusal, Stage
+from palpate.answer.pipeline import Context, JudgeInputs, Refusal, Stage
 from palpate.core.schema import Positive, check
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
@@ -29,7 +29,7 @@ class DisplacementRule:
     def __post_init__(self) -> None:
         check(self, "displacement")
 
-    def judges(self, given: Given) -> list[Stage]:
+    def judges(self, given: JudgeInputs) -> list[Stage]:
         """Whether the contact is within reach."""
         return [] if self.farthest_mm is None else [WithinReach(self.farthest_mm)]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from palpate.answer.window import Window
 from palpate.core.status import Remark
 from palpate.core.types import Status, Sweep
-
-if TYPE_CHECKING:
-    from palpate.answer.objects import EnrolledLabels
 
 Array = NDArray[Any]
 
@@ -114,14 +111,14 @@ class Context:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class JudgeInputs:
     """Data that a rule may need with its parameters. labels: [K]. window: frames of a whole window.
-    enrolled: for the label of the answer. beyond: see Disturbances. height: of the pattern in a
-    sweep; None if slides on this skin cannot be measured."""
+    decided: as of EnrolledLabels. beyond: see Disturbances. height: of the pattern in a sweep; None
+    if slides on this skin cannot be measured."""
 
     labels: Sequence[str]
     window: int
-    enrolled: EnrolledLabels
+    decided: Callable[[Array], Array]
     beyond: Callable[[str, Mapping[str, float]], float]
     height: Callable[[Context], float] | None
 

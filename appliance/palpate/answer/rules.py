@@ -12,7 +12,7 @@ from palpate.answer.contact import ContactPositions
 from palpate.answer.displacement import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
-from palpate.answer.pipeline import Given, Stage
+from palpate.answer.pipeline import JudgeInputs, Stage
 from palpate.answer.slide import SpeedRange
 from palpate.answer.taxels import Bridging
 from palpate.answer.unknown import Known
@@ -38,7 +38,7 @@ class Rules:
     known: Known | None = None
     contact: ContactPositions | None = None
 
-    def judges(self, given: Given) -> list[Stage]:
+    def judges(self, given: JudgeInputs) -> list[Stage]:
         """The stages after the network."""
         rules = [getattr(self, field.name) for field in fields(Rules)]
         return [stage for rule in rules if hasattr(rule, "judges") for stage in rule.judges(given)]

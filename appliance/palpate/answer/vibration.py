@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context, Given, Refusal, Stage
+from palpate.answer.pipeline import Context, JudgeInputs, Refusal, Stage
 from palpate.answer.slide import ShowsPattern
 from palpate.answer.window import TINY, Counts, Window, ones
 from palpate.core.schema import Positive, check
@@ -47,7 +47,7 @@ class SlideLimits:
         least = self.least[label]
         return [part for part, found in enumerate(vibrations.tolist(), 1) if found < least]
 
-    def judges(self, given: Given) -> list[Stage]:
+    def judges(self, given: JudgeInputs) -> list[Stage]:
         """Whether a pattern shows, and whether the finger vibrates."""
         vibrates = Vibrates(self, given)
         if self.pattern is None or given.height is None:
@@ -78,7 +78,7 @@ class Vibrates:
     the label of the answer vibrates more. A load beyond that of training counts as that of
     training: vibrations grow less than it."""
 
-    def __init__(self, limits: SlideLimits, given: Given) -> None:
+    def __init__(self, limits: SlideLimits, given: JudgeInputs) -> None:
         self._limits, self._given = limits, given
 
     def apply(self, context: Context) -> Refusal | None:
@@ -89,7 +89,7 @@ class Vibrates:
         if not parts or len(context.taxels) < 2 * parts:
             return None
         beyond = self._given.beyond("load", context.disturbed)
-        label = int(self._given.enrolled.decided(context.probabilities).argmax())
+        label = int(self._given.decided(context.probabilities).argmax())
         found = self._limits.resting(vibration(context.window, context.tare, parts) + beyond, label)
         if not found:
             return None

@@ -25,7 +25,7 @@ from palpate.answer.objects import (
     ObjectSweeps,
     softmax,
 )
-from palpate.answer.pipeline import Context, Given, Stage, run
+from palpate.answer.pipeline import Context, JudgeInputs, Stage, run
 from palpate.answer.slide import MeasureSlide
 from palpate.answer.taxels import TaxelWatch
 from palpate.answer.unknown import ClassDistances, KnownMaterial
@@ -144,7 +144,9 @@ class Classifier(Observer):
         m, least = self.bundle.manifest, self.settings.min_probability
         beyond = (m.disturbances or Disturbances()).beyond
         height = self._slide.height if self._slide and self._slide.able else None
-        given = Given(m.labels, m.format.window, self._objects.enrolled, beyond, height)
+        given = JudgeInputs(
+            m.labels, m.format.window, self._objects.enrolled.decided, beyond, height
+        )
         displaced = max(least, m.displacement.unsure if m.displacement else 0.0)
         return [GivesNumbers(), *m.judges(given), self._objects, Certain(least, displaced)]
 

@@ -64,7 +64,7 @@ def test_a_network_of_hostile_names(monkeypatch):
     terminal."""
     clock, asked = VirtualClock(), []
 
-    class Network:
+    class HostileNetwork:
         def __init__(self, interfaces: object) -> None:
             pass
 
@@ -84,11 +84,11 @@ def test_a_network_of_hostile_names(monkeypatch):
             clock.sleep_until(clock.now_ns() + 1_000_000 * timeout)
             return None
 
-    def browse(one: Network, kind: str, handlers: list) -> None:
+    def browse(one: HostileNetwork, kind: str, handlers: list) -> None:
         for name in ("0\x1b[31m page", *map("x{}".format, range(5000))):
             handlers[0](one, kind, name, None)
 
-    monkeypatch.setattr("zeroconf.Zeroconf", Network)
+    monkeypatch.setattr("zeroconf.Zeroconf", HostileNetwork)
     monkeypatch.setattr("zeroconf.ServiceBrowser", browse)
     assert network.found(clock) == [network.Reachable("0?[31m", "page?[2J", "10.0.0.1", 1)]
     assert len(asked) < 30
