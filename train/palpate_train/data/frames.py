@@ -466,3 +466,22 @@ def fields(
         (slice(a, b), dict(zip(columns, rows[a], strict=True)))
         for a, b in zip(starts, [*starts[1:], count], strict=True)
     ]
+
+
+def check_order(
+    table: Table, orders: dict[tuple[str, ...], tuple[str, ...]], plan: ImportPlan
+) -> None:
+    """Raise FormatError if the columns of the taxels stood in another order in an earlier file:
+    taxels would change places. --columns with their names gives one order to all files. orders: of
+    the files so far, by the sorted names."""
+    others = (plan.time.rpartition(":")[0], *plan.fields.values())
+    names = enumerate(table.columns)
+    columns = tuple(name for i, name in names if name not in others and i not in table.texts)
+    before = orders.setdefault(tuple(sorted(columns)), columns)
+    named = bool(plan.columns) and all(part in columns for part in plan.columns.split(","))
+    if before != columns and not named:
+        here, there = next((a, b) for a, b in zip(columns, before, strict=True) if a != b)
+        raise FormatError(
+            f"has the column {here!r} where another file has {there!r}; "
+            "give the order of the taxels with --columns and their names"
+        )

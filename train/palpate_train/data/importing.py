@@ -122,7 +122,7 @@ def import_folder(
         name, known, read = source
         try:
             table = read()
-            _check_order(table, orders, plan)
+            frames.check_order(table, orders, plan)
             recordings += _recordings(table, name, known, plan)
         except frames.GridMissing as e:
             if not recordings:  # the other files would fail, too, after the time to read them
@@ -289,25 +289,6 @@ def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> lis
         said = (*table.notes, *notes)
         made.append(Recording(at, {**known, **found}, counts[part], times, said))
     return made
-
-
-def _check_order(
-    table: Table, orders: dict[tuple[str, ...], tuple[str, ...]], plan: ImportPlan
-) -> None:
-    """Raise FormatError if the columns of the taxels stood in another order in an earlier file:
-    taxels would change places. --columns with their names gives one order to all files. orders: of
-    the files so far, by the sorted names."""
-    others = (plan.time.rpartition(":")[0], *plan.fields.values())
-    names = enumerate(table.columns)
-    columns = tuple(name for i, name in names if name not in others and i not in table.texts)
-    before = orders.setdefault(tuple(sorted(columns)), columns)
-    named = bool(plan.columns) and all(part in columns for part in plan.columns.split(","))
-    if before != columns and not named:
-        here, there = next((a, b) for a, b in zip(columns, before, strict=True) if a != b)
-        raise FormatError(
-            f"has the column {here!r} where another file has {there!r}; "
-            "give the order of the taxels with --columns and their names"
-        )
 
 
 def _without_copies(
