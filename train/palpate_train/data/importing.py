@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -452,13 +452,8 @@ def _set(
         units=units,
         displays={name: texts[0] for name, texts in displays.items() if len(texts) == 1},
     )
-    alike = [(a, b) for a in materials for b in materials if a < b and a.lower() == b.lower()]
     return sweeps, [
-        *(
-            f"warning: materials {a!r} and {b!r} differ in capitals alone; --rename '{a}={b}' "
-            "joins them"
-            for a, b in alike
-        ),
+        *_alike(materials),
         *(
             f"{text!r} is sent as {name!r}; --rename changes that"
             for name, texts in displays.items()
@@ -466,6 +461,14 @@ def _set(
         ),
         *(f"{name} is in {unit}, as its name says" for name, unit in units.items()),
     ]
+
+
+def _alike(materials: Sequence[str]) -> Iterator[str]:
+    """Warnings about materials whose names differ in capitals alone."""
+    for a, b in combinations(materials, 2):
+        if a.lower() == b.lower():
+            differ = f"warning: materials {a!r} and {b!r} differ in capitals alone"
+            yield f"{differ}; --rename '{a}={b}' joins them"
 
 
 def _displays(known: Sequence[Fields]) -> dict[str, list[str]]:
