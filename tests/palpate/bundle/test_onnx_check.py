@@ -78,6 +78,15 @@ def test_a_file_that_ends_anywhere_is_refused(default):
             check.check(default.model[:end], default.manifest)
 
 
+def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path, monkeypatch):
+    """A model with external data in a file or a symlink is refused before anything is opened."""
+    (tmp_path / "secret").write_bytes(bytes(16))
+    (tmp_path / "weights.bin").symlink_to(tmp_path / "secret")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BundleError, match="field 13"):
+        check.check(HOSTILE["external data beside"][0], MANIFEST)
+
+
 @pytest.mark.parametrize(
     ("module", "limit"),
     [
