@@ -336,7 +336,7 @@ def test_a_sweep_that_looks_like_another_material_is_moved(browser: Any, tmp_pat
 def test_the_bar_shows_the_steps_and_the_time_of_use(browser: Any, tmp_path: Path):
     """Each step with its share and the seconds left; it moves before the first share is known."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=True) as one:
-        seen = BrowsedPage(browser.new_context(), one.page.server.address)
+        seen = BrowsedPage(browser, one.page.server.address)
         for step, done, left_s, words in (
             ("start", 0.0, None, "waiting for the processor, for"),
             ("heads", 0.06, 9.3, "about 10 s left"),
@@ -351,7 +351,6 @@ def test_the_bar_shows_the_steps_and_the_time_of_use(browser: Any, tmp_path: Pat
         one.more = {"teach": {**TAUGHT["teach"], "using": None}}
         until(lambda: seen.page.is_hidden("#using"))
         assert not seen.errors
-        seen.page.context.close()
 
 
 COVERED = """() => {
