@@ -51,10 +51,12 @@ class GraphBuilder:
         self.constants.append(numpy_helper.from_array(np.array(value, dtype, order="C"), name))
         return name
 
-    def __call__(self, op: str, *inputs: str, output: str = "", **attributes: Any) -> str:
-        """Add one node; returns the name of its output."""
+    def __call__(self, op: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
+        """Add one node; returns the name of its output. inputs: names, and whole numbers, lists or
+        arrays of them, which become int64 constants."""
         output = output or f"{op.lower()}{len(self.nodes)}"
-        self.nodes.append(helper.make_node(op, inputs, [output], name=output, **attributes))
+        names = [one if isinstance(one, str) else self.constant(one, "int64") for one in inputs]
+        self.nodes.append(helper.make_node(op, names, [output], name=output, **attributes))
         return output
 
     def model(self, format: SweepFormat, output: str, *size: int) -> onnx.ModelProto:
@@ -87,19 +89,11 @@ def centred(g: GraphBuilder, format: SweepFormat) -> tuple[str, str]:
     """
     taxels = format.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
-    ones = g("ConstantOfShape", g.constant([format.window, 1], "int64"), value=one)
-    x = g(
-        "Cast",
-        g("Reshape", "sweep", g.constant([format.window, taxels], "int64")),
-        to=TensorProto.FLOAT,
-    )
+    ones = g("ConstantOfShape", [format.window, 1], value=one)
+    x = g("Cast", g("Reshape", "sweep", [format.window, taxels]), to=TensorProto.FLOAT)
     sums = g("Gemm", ones, x, transA=1)
     x = g("Gemm", ones, sums, x, alpha=-1 / format.window)
-    return g(
-        "Transpose",
-        g("Reshape", x, g.constant([1, format.window, taxels], "int64")),
-        perm=[0, 2, 1],
-    ), sums
+    return g("Transpose", g("Reshape", x, [1, format.window, taxels]), perm=[0, 2, 1]), sums
 
 
 def quantized(g: GraphBuilder, x: str, step: float, zero: int = 0) -> str:
@@ -182,11 +176,7 @@ def sums(
     for [..., C, steps]. The box computes the matrix of ones and zeros from a few numbers when it
     loads the graph; as a constant it would be large.
     """
-    at = g(
-        "Reshape",
-        g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))),
-        g.constant([1, steps], "int64"),
-    )
+    at = g("Reshape", g("Range", *(g.constant(n, "int32") for n in (0, steps, 1))), [1, steps])
     counts = np.asarray(counts)
     known = g(
         "Less",
@@ -210,7 +200,7 @@ def mean_factors(
     )  # the sum of no steps is 0, so its mean is 0
     lead = (len(counts), 1) if rowwise else (1, len(counts))
     factors = factors.reshape(*lead, 1) if len(counts) > 1 else factors[0]
-    return g("Expand", g.constant(factors), g.constant([*lead, size], "int64"))
+    return g("Expand", g.constant(factors), [*lead, size])
 
 
 def side_by_side(g: GraphBuilder, parts: Sequence[str]) -> str:

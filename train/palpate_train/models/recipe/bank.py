@@ -248,12 +248,8 @@ def pooled(
     def mean(z: str) -> str:
         """[n, steps, F] -> means over the responses of each filter."""
         total = graph_builder.sums(g, z, steps, counts, integers=how.int8, rowwise=how.rowwise)
-        total = g(
-            "Reshape",
-            g("Cast", total, to=FLOAT) if how.int8 else total,
-            g.constant([*counts.shape, -1], "int64"),
-        )
-        return g("ReduceSum", g("Mul", total, weights), g.constant([1], "int64"))
+        total = g("Reshape", g("Cast", total, to=FLOAT) if how.int8 else total, [*counts.shape, -1])
+        return g("ReduceSum", g("Mul", total, weights), [1])
 
     def magnitudes() -> str:
         size = g("Sub", *map(mean, _sides(g, y))) if how.int8 else mean(g("Abs", y))

@@ -104,23 +104,18 @@ def pooled(
     [1, 1 or PREFIXES, len(some)] for each signal, taxel and level. int8: whether frames are counted
     in integers."""
     if len(some.taxels) < format.channels:
-        x = g("Gather", x, g.constant(some.taxels, "int64"), axis=1)
+        x = g("Gather", x, some.taxels, axis=1)
     looked, taxels = _looked(format.window), len(some.taxels)
     counts = looked.known_steps(format.window, prefixes)
     total = partial(graph_builder.sums, g, steps=looked.steps, counts=counts, rowwise=prefixes)
     older, newer = (
-        g(
-            "Slice",
-            x,
-            *(g.constant([n], "int64") for n in (at, format.window - 1 + at, 2, looked.hop)),
-        )
-        for at in (0, 1)
+        g("Slice", x, [at], [format.window - 1 + at], [2], [looked.hop]) for at in (0, 1)
     )
     changes, older = (
         g("Transpose", signal, perm=[0, 2, 1]) for signal in (g("Sub", newer, older), older)
     )
     if prefixes:  # each prefix has its own means
-        changes = g("Expand", changes, g.constant([PREFIXES, looked.steps, taxels], "int64"))
+        changes = g("Expand", changes, [PREFIXES, looked.steps, taxels])
     about = g(
         "Sub",
         older,
@@ -130,13 +125,11 @@ def pooled(
     # comparing a level with a whole row of frames is four times as fast as comparing a frame with
     # a row of levels
     levels = some.levels.reshape(SIGNALS * taxels, -1, 1) / step
-    above = g("Greater", g("Reshape", y, g.constant([0, 0, 1, -1], "int64")), g.constant(levels))
+    above = g("Greater", g("Reshape", y, [0, 0, 1, -1]), g.constant(levels))
     above = g(
-        "Reshape",
-        g("Cast", above, to=TensorProto.UINT8 if int8 else FLOAT),
-        g.constant([0, len(some), -1], "int64"),
+        "Reshape", g("Cast", above, to=TensorProto.UINT8 if int8 else FLOAT), [0, len(some), -1]
     )
     above = total(above, integers=int8, time_last=True)
     shares = g("Cast", above, to=FLOAT) if int8 else above
     shares = g("Mul", shares, graph_builder.mean_factors(g, 1.0, counts, len(some), prefixes))
-    return g("Reshape", shares, g.constant([1, PREFIXES, -1], "int64")) if prefixes else shares
+    return g("Reshape", shares, [1, PREFIXES, -1]) if prefixes else shares

@@ -95,7 +95,7 @@ def trunk_graph(
     features = graph_builder.side_by_side(g, parts)
     shape = [1, PREFIXES, size] if prefixes else [1, size]
     name = "tenths" if prefixes else "features"
-    output = g("Reshape", features, g.constant(shape, "int64"), output=name)
+    output = g("Reshape", features, shape, output=name)
     return g.model(format, output, *shape[1:])
 
 
@@ -138,7 +138,7 @@ class _TrunkNodes:
         self._rowwise = prefixes and not self._zero_sum
         # a byte does not hold wider counts: fixed features of these stay in float (decision 4)
         self._own = ranges if format.dtype == "uint8" else None
-        shape = self.g.constant([1, format.window, format.channels], "int64")
+        shape = [1, format.window, format.channels]
         self.raw = self.g("Reshape", "sweep", shape)
         self.attenuation = self._attenuation()
         self._prepared: dict[Ranges | None, Prepared] = {}
@@ -173,7 +173,7 @@ class _TrunkNodes:
         log = g("Log", g("Add", means, g.constant(FLOOR)))
         if not self._rowwise:
             return [log]
-        return [g("Reshape", log, g.constant([1, PREFIXES, sum(channels)], "int64"))]
+        return [g("Reshape", log, [1, PREFIXES, sum(channels)])]
 
     def bank(self, weights: Mapping[str, Array]) -> list[str]:
         """See bank.pooled."""
@@ -262,14 +262,14 @@ class _TrunkNodes:
     def _every(self, step: int, start: int) -> str:
         """Raw counts of every step-th frame from `start` on, but not of a last frame that has no
         neighbour."""
-        ends = (self.g.constant([n], "int64") for n in (start, self._format.window - 1 + start, 1))
-        return self.g("Slice", self.raw, *ends, self.g.constant([step], "int64"))
+        end = self._format.window - 1 + start
+        return self.g("Slice", self.raw, [start], [end], [1], [step])
 
     def _attenuated_bytes(self) -> str:
         """Attenuated raw counts [1, T, R * C] as bytes; exact where the factor is 1."""
         g, format, scale = self.g, self._format, self._scale
         factors = graph_builder.quantized(g, self.attenuation, 1 / 255)
-        shape = g.constant([1, format.window, format.channels], "int64")
+        shape = [1, format.window, format.channels]
         factors = g("Expand", factors, shape)
         counts = graph_builder.counts_of(g, self.raw, scale)
         product = g("Mul", counts, graph_builder.counts_of(g, factors, 1 / 255))

@@ -69,17 +69,17 @@ def nodes(
     x = celled(g, raw, attenuation, format, scale)
     size, steps = len(cells(format)), length * PREFIXES // hop
     changes = _changes(g, x, length * PREFIXES, hop, size, used)
-    parts = g("Reshape", changes, g.constant([used, rows, steps // rows, size], "int64"))
+    parts = g("Reshape", changes, [used, rows, steps // rows, size])
     squares = g("MatMul", g("Transpose", parts, perm=[0, 1, 3, 2]), parts)
-    squares = g("Reshape", squares, g.constant([used, rows, size * size], "int64"))
-    totals = g("Reshape", g("ReduceMean", parts, axes=[2]), g.constant([used, rows, size], "int64"))
+    squares = g("Reshape", squares, [used, rows, size * size])
+    totals = g("Reshape", g("ReduceMean", parts, axes=[2]), [used, rows, size])
     # a prefix has the sums of all tenths up to its end
     upto = np.tril(np.ones((rows, rows))) / np.arange(1, rows + 1)[:, None]
     squares = g("MatMul", g.constant(upto * rows / steps), squares)
     means = g("MatMul", g.constant(upto), totals)
     features = _relations(g, squares, means, size)
     features = g("Transpose", features, perm=[1, 0, 2])
-    return g("Reshape", features, g.constant([1, rows, used * each(format)], "int64"))
+    return g("Reshape", features, [1, rows, used * each(format)])
 
 
 def celled(g: GraphBuilder, raw: str, attenuation: str, format: SweepFormat, scale: float) -> str:
@@ -97,7 +97,7 @@ def _relations(g: GraphBuilder, squares: str, means: str, size: int) -> str:
     correlations [n, rows, size + pairs]."""
 
     def at(x: str, numbers: Array) -> str:
-        return g("Gather", x, g.constant(numbers, "int64"), axis=2)
+        return g("Gather", x, numbers, axis=2)
 
     first, second = np.triu_indices(size, 1)
     same = np.arange(size)
@@ -121,10 +121,10 @@ def _changes(g: GraphBuilder, x: str, frames: int, hop: int, size: int, used: in
     first."""
 
     def cut(y: str, start: int, end: int, step: int = 1) -> str:
-        return g("Slice", y, *(g.constant([n], "int64") for n in (start, end, 1, step)))
+        return g("Slice", y, [start], [end], [1], [step])
 
     def still(steps: int) -> str:
-        return g("Expand", cut(x, 0, 1), g.constant([1, steps, size], "int64"))
+        return g("Expand", cut(x, 0, 1), [1, steps, size])
 
     lags, steps = LAGS[: used - 1], frames // hop
     most = max(lags, default=1)

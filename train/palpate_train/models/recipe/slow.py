@@ -48,9 +48,9 @@ def nodes(
     count(format)]. Of large skins each cell of relations.py is one taxel."""
     length = format.window // PREFIXES
     x = relations.celled(g, raw, attenuation, format, scale)
-    x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * PREFIXES, 1)))
+    x = g("Slice", x, [0], [length * PREFIXES], [1])
     size = len(relations.cells(format))
-    x = g("Reshape", x, g.constant([PREFIXES, length, size], "int64"))
+    x = g("Reshape", x, [PREFIXES, length, size])
     x = g("Transpose", x, perm=[0, 2, 1])
     parts = [_lines(g, x, length, size, prefixes)]
     parts.append(_tenths(g, x, length, size, spectrum.mains(format, mains_hz), prefixes))
@@ -61,35 +61,23 @@ def _lines(g: GraphBuilder, x: str, length: int, size: int, prefixes: bool) -> s
     """[PREFIXES, k, length] -> log powers [1, rows, k * bands] of the lowest lines. The mean of a
     prefix is subtracted; the lines of a whole window do not respond to it."""
     frames, edges = length * PREFIXES, _edges(length * PREFIXES)
-    n = g("Range", *(g.constant(end, "int64") for end in (0, frames, 1)))
-    n = g("Unsqueeze", n, g.constant([1], "int64"))
-    turn = g(
-        "Mod",
-        g("Mul", n, g.constant(np.arange(1, edges[-1]), "int64")),
-        g.constant(frames, "int64"),
-    )
+    n = g("Range", 0, frames, 1)
+    n = g("Unsqueeze", n, [1])
+    turn = g("Mod", g("Mul", n, np.arange(1, edges[-1])), frames)
     phase = g("Mul", g("Cast", turn, to=FLOAT), g.constant(2 * np.pi / frames))
     waves = g("Concat", g("Cos", phase), g("Sin", phase), axis=1)
     width = 2 * (int(edges[-1]) - 1)
-    waves = g("Reshape", waves, g.constant([PREFIXES, length, width], "int64"))
-    each = g("Reshape", g("MatMul", x, waves), g.constant([PREFIXES, size * width], "int64"))
+    waves = g("Reshape", waves, [PREFIXES, length, width])
+    each = g("Reshape", g("MatMul", x, waves), [PREFIXES, size * width])
     rows = PREFIXES if prefixes else 1
     upto = np.tri(PREFIXES) if prefixes else np.ones((1, PREFIXES))
     known = upto.sum(axis=1, keepdims=True) * length
-    found = g(
-        "Reshape", g("MatMul", g.constant(upto), each), g.constant([rows, size, width], "int64")
-    )
+    found = g("Reshape", g("MatMul", g.constant(upto), each), [rows, size, width])
     if prefixes:
-        total = g("ReduceSum", x, g.constant([2], "int64"), keepdims=0)
+        total = g("ReduceSum", x, [2], keepdims=0)
         mean = g("MatMul", g.constant(upto / known), total)
-        responses = g(
-            "MatMul", g.constant(upto), g("ReduceSum", waves, g.constant([1], "int64"), keepdims=0)
-        )
-        offset = g(
-            "Mul",
-            g("Unsqueeze", mean, g.constant([2], "int64")),
-            g("Unsqueeze", responses, g.constant([1], "int64")),
-        )
+        responses = g("MatMul", g.constant(upto), g("ReduceSum", waves, [1], keepdims=0))
+        offset = g("Mul", g("Unsqueeze", mean, [2]), g("Unsqueeze", responses, [1]))
         found = g("Sub", found, offset)
     power = g("MatMul", g("Mul", found, found), g.constant(_averages(edges, 1)))
     return _log(
@@ -103,7 +91,7 @@ def _tenths(g: GraphBuilder, x: str, length: int, size: int, mains: float, prefi
     found = g("MatMul", x, spectrum.wave_nodes(g, length, mains, int(edges[-1])))
     power = g("MatMul", g("Mul", found, found), g.constant(_averages(edges, 2)))
     width = size * (len(edges) - 1)
-    power = g("Reshape", power, g.constant([PREFIXES, width], "int64"))
+    power = g("Reshape", power, [PREFIXES, width])
     rows = PREFIXES if prefixes else 1
     upto = np.tri(PREFIXES) if prefixes else np.ones((1, PREFIXES))
     power = g("MatMul", g.constant(upto / upto.sum(axis=1, keepdims=True)), power)
@@ -112,7 +100,7 @@ def _tenths(g: GraphBuilder, x: str, length: int, size: int, mains: float, prefi
 
 def _log(g: GraphBuilder, power: str, rows: int, width: int) -> str:
     power = g("Log", g("Add", power, g.constant(spectrum.QUIET)))
-    return g("Reshape", power, g.constant([1, rows, width], "int64"))
+    return g("Reshape", power, [1, rows, width])
 
 
 def _edges(frames: int) -> Array:

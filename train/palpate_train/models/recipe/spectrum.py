@@ -54,25 +54,17 @@ def nodes(
     """
     length, axes, taxels = format.window // SEGMENTS, format.axes, format.rows * format.cols
     mean = scale / taxels * (np.tile(np.eye(axes), (taxels, 1)) if axes > 1 else 1)  # [M, A]
-    share = g(
-        "Mul",
-        g("Reshape", attenuation, g.constant([format.channels, 1], "int64")),
-        g.constant(mean),
-    )
+    share = g("Mul", g("Reshape", attenuation, [format.channels, 1]), g.constant(mean))
     x = g("MatMul", g("Cast", raw, to=TensorProto.FLOAT), share)
     if format.window % SEGMENTS:
-        x = g("Slice", x, *(g.constant([n], "int64") for n in (0, length * SEGMENTS, 1)))
+        x = g("Slice", x, [0], [length * SEGMENTS], [1])
     if axes > 1:
-        x = g(
-            "Transpose",
-            g("Reshape", x, g.constant([SEGMENTS, length, axes], "int64")),
-            perm=[0, 2, 1],
-        )
-    x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
+        x = g("Transpose", g("Reshape", x, [SEGMENTS, length, axes]), perm=[0, 2, 1])
+    x = g("Reshape", x, [SEGMENTS * axes, length])
     x = g("MatMul", x, wave_nodes(g, length, mains(format, mains_hz), length + 1))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
-        power = g("Reshape", power, g.constant([SEGMENTS, count(format)], "int64"))
+        power = g("Reshape", power, [SEGMENTS, count(format)])
     if prefixes:
         power = g(
             "MatMul", g.constant(np.tri(SEGMENTS) / np.arange(1, SEGMENTS + 1)[:, None]), power
@@ -80,7 +72,7 @@ def nodes(
     else:
         power = g("ReduceMean", power, axes=[0])
     power = g("Log", g("Add", power, g.constant(QUIET)))
-    return g("Reshape", power, g.constant([1, SEGMENTS if prefixes else 1, count(format)], "int64"))
+    return g("Reshape", power, [1, SEGMENTS if prefixes else 1, count(format)])
 
 
 def _edges(length: int) -> Array:
@@ -119,16 +111,9 @@ def wave_nodes(g: GraphBuilder, length: int, mains: float, end: int) -> str:
     """Nodes that compute the waves [length, 2 * (end - 2)] of 2 to `end` - 1 half periods: cosines,
     then sines, tapered and orthogonal to offset and mains. onnxruntime folds them into one constant
     when it loads the model, so that the file does not hold them."""
-    one = g.constant(1, "int64")
-    n = g(
-        "Unsqueeze",
-        g("Range", g.constant(0, "int64"), g.constant(length, "int64"), one),
-        g.constant([1], "int64"),
-    )
-    k = g("Range", g.constant(2, "int64"), g.constant(end, "int64"), one)
-    phase = g(
-        "Cast", g("Mod", g("Mul", n, k), g.constant(2 * length, "int64")), to=TensorProto.FLOAT
-    )
+    n = g("Unsqueeze", g("Range", 0, length, 1), [1])
+    k = g("Range", 2, end, 1)
+    phase = g("Cast", g("Mod", g("Mul", n, k), 2 * length), to=TensorProto.FLOAT)
     phase = g("Mul", phase, g.constant(np.pi / length))
     waves = g(
         "Mul", g("Concat", g("Cos", phase), g("Sin", phase), axis=1), g.constant(_window(length))
@@ -141,8 +126,8 @@ def wave_nodes(g: GraphBuilder, length: int, mains: float, end: int) -> str:
 def _averaging_nodes(g: GraphBuilder, edges: Array) -> str:
     """Nodes that compute the matrix that averages squares over each band; folded like those of
     `wave_nodes`."""
-    k = g("Range", *(g.constant(n, "int64") for n in (2, int(edges[-1]), 1)))
-    k = g("Unsqueeze", g("Concat", k, k, axis=0), g.constant([1], "int64"))
-    below, beyond = (g("Less", k, g.constant(side, "int64")) for side in (edges[:-1], edges[1:]))
+    k = g("Range", 2, int(edges[-1]), 1)
+    k = g("Unsqueeze", g("Concat", k, k, axis=0), [1])
+    below, beyond = (g("Less", k, side) for side in (edges[:-1], edges[1:]))
     inside = g("Cast", g("And", g("Not", below), beyond), to=TensorProto.FLOAT)
     return g("Mul", inside, g.constant(1 / np.diff(edges)))

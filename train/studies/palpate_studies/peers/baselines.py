@@ -119,7 +119,7 @@ class Gauss(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-lea
         white = g(
             "MatMul", g("Sub", features, g.constant(self.means_[:, None])), g.constant(self.whites_)
         )
-        squares = g("ReduceSum", g("Mul", white, white), g.constant([1, 2], "int64"), keepdims=0)
+        squares = g("ReduceSum", g("Mul", white, white), [1, 2], keepdims=0)
         half = g("Mul", squares, g.constant(-0.5))
         return g("Add", half, g.constant(self.constants_[None]))
 
@@ -207,7 +207,7 @@ def to_onnx(estimator: Estimator, classes: int, temperature: float = 1.0) -> onn
     column = np.full(classes, len(estimator.classes_))
     column[estimator.classes_] = np.arange(len(estimator.classes_))
     with_absent = g("Concat", log_p, g.constant([[ABSENT]]), axis=1)
-    g("Gather", with_absent, g.constant(column, "int64"), axis=1, output="logits")
+    g("Gather", with_absent, column, axis=1, output="logits")
     features = helper.make_tensor_value_info("features", TensorProto.FLOAT, [1, size])
     logits = helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, classes])
     graph = helper.make_graph(g.nodes, "palpate", [features], [logits], g.constants)

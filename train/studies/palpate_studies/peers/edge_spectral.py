@@ -112,22 +112,15 @@ class SpectralNetwork(PeerNetwork):
         fourth = g("ReduceMean", g("Mul", square, square), axes=[2], keepdims=0)
         skewness = g("Div", third, g("Mul", variance, root))
         kurtosis = g("Sub", g("Div", fourth, g("Mul", variance, variance)), g.constant(3.0))
-        rows = g("Reshape", x, g.constant([taxels, 1, self.format.window], "int64"))
+        rows = g("Reshape", x, [taxels, 1, self.format.window])
         parts = g(
             "Conv", rows, g.constant(self.waves.numpy()), strides=[self.hop], pads=[0, self.missing]
         )
         frames = (self.format.window + self.missing - 2 * self.bins) // self.hop + 1
-        parts = g(
-            "Reshape", g("Mul", parts, parts), g.constant([taxels, 2, self.bins, frames], "int64")
-        )
-        power = g(
-            "ReduceMean",
-            g("ReduceSum", parts, g.constant([1], "int64"), keepdims=0),
-            axes=[2],
-            keepdims=0,
-        )
+        parts = g("Reshape", g("Mul", parts, parts), [taxels, 2, self.bins, frames])
+        power = g("ReduceMean", g("ReduceSum", parts, [1], keepdims=0), axes=[2], keepdims=0)
         log_power = g("Log", g("Add", power, g.constant(FLOOR)))
-        log_power = g("Reshape", log_power, g.constant([1, taxels * self.bins], "int64"))
+        log_power = g("Reshape", log_power, [1, taxels * self.bins])
         x = g("Concat", root, skewness, kurtosis, log_power, axis=1)
         x = g("Div", g("Sub", x, g.constant(self.centre.numpy())), g.constant(self.spread.numpy()))
         for layer in (self.first, self.second):

@@ -98,11 +98,7 @@ def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelP
     counts, taxels, dilations, per_kernel, biases = parameters
     g, size, at = GraphBuilder(), format.channels, 0
     chosen = iter(np.split(taxels, np.cumsum(counts)[:-1]))
-    x = g(
-        "Cast",
-        g("Reshape", "sweep", g.constant([1, format.window, size], "int64")),
-        to=TensorProto.FLOAT,
-    )
+    x = g("Cast", g("Reshape", "sweep", [1, format.window, size]), to=TensorProto.FLOAT)
     x, parts = g("Transpose", x, perm=[0, 2, 1]), []
     for number, (dilation, n) in enumerate(
         zip(dilations.tolist(), per_kernel.tolist(), strict=True)
@@ -121,9 +117,7 @@ def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelP
                 dilations=[dilation],
                 pads=[padding, padding],
             )
-            above = g(
-                "Greater", g("Unsqueeze", y, g.constant([2, 3], "int64")), g.constant(bias[half::2])
-            )
+            above = g("Greater", g("Unsqueeze", y, [2, 3]), g.constant(bias[half::2]))
             halves.append(
                 g("ReduceMean", g("Cast", above, to=TensorProto.FLOAT), axes=[4], keepdims=0)
             )
@@ -141,10 +135,6 @@ def _ridge(features: Array, labels: Array) -> tuple[Array, Array]:
 
 METHODS = (
     Method(
-        "minirocket",
-        "MiniRocket of aeon + ridge (Dempster et al. 2021)",
-        "raw",
-        train,
-        "peers",
+        "minirocket", "MiniRocket of aeon + ridge (Dempster et al. 2021)", "raw", train, "peers"
     ),
 )

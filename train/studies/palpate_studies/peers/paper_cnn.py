@@ -153,11 +153,7 @@ class ImageNetwork(PeerNetwork):
             x = g("Transpose", centred(g, format)[0], perm=[0, 2, 1])
         else:
             x = g("Sub", g("Cast", "sweep", to=TensorProto.FLOAT), g.constant(self.offset))
-        x = g(
-            "Mul",
-            g("Reshape", x, g.constant([1, 1, steps, taxels], "int64")),
-            g.constant(self.scale),
-        )
+        x = g("Mul", g("Reshape", x, [1, 1, steps, taxels]), g.constant(self.scale))
         for conv, norm in self._convolutions():
             if isinstance(norm, nn.BatchNorm2d):
                 conv = fuse_conv_bn_eval(conv.eval(), norm.eval())

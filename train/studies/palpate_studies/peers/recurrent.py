@@ -72,7 +72,7 @@ class Recurrent(PeerNetwork):
             hidden_size=STATE,
             linear_before_reset=1,
         )
-        x = g("Reshape", g("ReduceMean", x, axes=[0]), g.constant([1, STATE], "int64"))
+        x = g("Reshape", g("ReduceMean", x, axes=[0]), [1, STATE])
         g("Gemm", x, *layer_constants(g, self.head), transB=1, output="logits")
         return g.model(self.format, "logits", self.head.out_features)
 

@@ -118,12 +118,7 @@ def encode(patches: Array, atoms: Array) -> Array:
     long sweep."""
     n, frames, rows, cols = patches.shape
     g, format = GraphBuilder(), SweepFormat(rows, cols, 1.0, n * frames, "float32")
-    g(
-        "Reshape",
-        _codes(g, format, atoms, frames, 1.0),
-        g.constant([1, -1], "int64"),
-        output="features",
-    )
+    g("Reshape", _codes(g, format, atoms, frames, 1.0), [1, -1], output="features")
     sweep = patches.reshape(1, n * frames, rows, cols).astype(np.float32)
     return run(g.model(format, "features", n * len(atoms)), sweep).reshape(n, len(atoms))
 
@@ -137,11 +132,7 @@ def pooled(format: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
     """
     g, steps = GraphBuilder(), (format.window - atoms.shape[1]) // STEP + 1
     rows, cols = format.rows - atoms.shape[2] + 1, format.cols - atoms.shape[3] // format.axes + 1
-    codes = g(
-        "Reshape",
-        _codes(g, format, atoms, STEP, scale),
-        g.constant([steps, rows, cols, -1], "int64"),
-    )
+    codes = g("Reshape", _codes(g, format, atoms, STEP, scale), [steps, rows, cols, -1])
     both = g("Concat", codes, g("Neg", codes), axis=3)
     times = [part for level in LEVELS if level <= steps for part in _parts(steps, level)]
     spaces = {
@@ -156,7 +147,7 @@ def pooled(format: SweepFormat, atoms: Array, scale: float) -> onnx.ModelProto:
             )
     above = g("Relu", g("Concat", *cells, axis=0))
     length = g("Sqrt", g("Add", g("ReduceSumSquare", above, axes=[1]), g.constant(CONTRAST)))
-    g("Reshape", g("Div", above, length), g.constant([1, -1], "int64"), output="features")
+    g("Reshape", g("Div", above, length), [1, -1], output="features")
     return g.model(format, "features", len(cells) * 2 * len(atoms))
 
 
@@ -168,7 +159,7 @@ def _parts(n: int, parts: int) -> list[tuple[int, int]]:
 
 def _cut(g: GraphBuilder, x: str, axis: int, part: tuple[int, int]) -> str:
     """`x` from part[0] to part[1] along `axis`."""
-    return g("Slice", x, *(g.constant([n], "int64") for n in (*part, axis)))
+    return g("Slice", x, *([n] for n in (*part, axis)))
 
 
 def _codes(g: GraphBuilder, format: SweepFormat, atoms: Array, step: int, scale: float) -> str:
@@ -181,11 +172,9 @@ def _codes(g: GraphBuilder, format: SweepFormat, atoms: Array, step: int, scale:
     """
     flat = atoms.reshape(len(atoms), -1)
     shape = [1, 1, format.window, format.rows, format.cols * format.axes]
-    x = g("Cast", g("Reshape", "sweep", g.constant(shape, "int64")), to=TensorProto.FLOAT)
+    x = g("Cast", g("Reshape", "sweep", shape), to=TensorProto.FLOAT)
     products = g("Conv", x, g.constant(atoms[:, None] * scale), strides=[step, 1, format.axes])
-    left = g(
-        "Transpose", g("Reshape", products, g.constant([len(atoms), -1], "int64")), perm=[1, 0]
-    )
+    left = g("Transpose", g("Reshape", products, [len(atoms), -1]), perm=[1, 0])
     return _pursuit(g, left, flat @ flat.T)
 
 
@@ -209,7 +198,7 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
     triangle: list[list[str]] = []
     for _ in range(ACTIVE):
         best = g("ArgMax", g("Abs", left), axis=1, keepdims=0)
-        at = g("Unsqueeze", best, g.constant([1], "int64"))
+        at = g("Unsqueeze", best, [1])
         beside = [g("GatherElements", direction, at, axis=1) for direction in directions]
         new = g("Gather", products, best)
         for share, direction in zip(beside, directions, strict=True):
