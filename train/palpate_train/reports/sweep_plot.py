@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import mlab
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
@@ -374,16 +375,10 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
 def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
     """Plot the mean power of all taxels and their range as amplitudes per root hertz, with the
     noise of rounding. taxels: [T, n]."""
-    from scipy.signal import welch
-
-    hz, power = welch(
-        taxels,
-        format.rate_hz,
-        nperseg=min(len(taxels), max(LONGEST, round(format.rate_hz))),
-        axis=0,
-    )
-    hz, power = hz[1:], np.maximum(power[1:], 1e-12 * power.max())
-    low, mean, high = (np.sqrt(of(axis=1)) for of in (power.min, power.mean, power.max))
+    piece = min(len(taxels), max(LONGEST, round(format.rate_hz)))
+    power, hz = _powers(mlab.psd, taxels, format.rate_hz, piece, piece // 2)
+    hz, power = hz[1:], np.maximum(power[:, 1:], 1e-12 * power.max())
+    low, mean, high = (np.sqrt(of(axis=0)) for of in (power.min, power.mean, power.max))
     axes.fill_between(hz, low, high, color=ACCENT, alpha=0.15, linewidth=0)
     axes.plot(hz, mean, color=ACCENT, linewidth=1.1)
     axes.set(xscale="log", yscale="log", xlim=(hz[0], hz[-1]))
@@ -405,17 +400,21 @@ def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
     axes.set_ylabel("counts/√Hz", color=GREY, size=SMALL)
 
 
+def _powers(of: Callable[..., Any], taxels: Array, rate_hz: float, piece: int, overlap: int) -> Any:
+    """Power densities [n, ...] of taxels [T, n] by mlab's psd or specgram, and its frequencies and
+    times. The mean of each piece is subtracted (Welch 1967)."""
+    window = np.hanning(piece + 1)[:-1]
+    how = {"detrend": "mean", "window": window, "noverlap": overlap}
+    power, *axes = zip(*(of(taxel, piece, rate_hz, **how) for taxel in taxels.T), strict=True)
+    return np.stack(power), *(axis[0] for axis in axes)
+
+
 def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
     """Draw the mean power of all taxels [T, n] in decibels over time and frequency, on the time
     axis of the signals."""
-    from scipy.signal import spectrogram
-
-    rate = sweep.format.rate_hz
     piece = min(len(taxels) // 4, PIECE)
-    hz, s, power = spectrogram(
-        taxels, rate, nperseg=piece, noverlap=3 * piece // 4, axis=0, detrend="constant"
-    )
-    db = 10 * np.log10(np.maximum(power.mean(axis=1), 1e-12))  # [frequencies, pieces]
+    power, hz, s = _powers(mlab.specgram, taxels, sweep.format.rate_hz, piece, 3 * piece // 4)
+    db = 10 * np.log10(np.maximum(power.mean(axis=0), 1e-12))  # [frequencies, pieces]
     half_s, half_hz = (s[1] - s[0]) / 2, (hz[1] - hz[0]) / 2
     ends = (start_s + s[0] - half_s, start_s + s[-1] + half_s, hz[0] - half_hz, hz[-1] + half_hz)
     axes.imshow(
