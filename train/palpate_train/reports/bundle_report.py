@@ -35,6 +35,8 @@ Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
 """Number of labels up to which the confusion matrix can be read on a phone. With more labels there
 is only the table."""
+NAME = 0.09, 0.1
+"""Width and height of the name of a limit, in the units of its picture."""
 QUARTERS = [0, 0.25, 0.5, 0.75, 1]
 ANSWERS = "answered", "named"
 LINES = ["-", "--", ":", "-."]
@@ -296,11 +298,14 @@ def strangers(found: Json) -> str:
         axes.plot(*np.transpose(of["curve"]), **line)
         axes.plot([0.515, 0.55], [0.97 - 0.12 * k] * 2, **line)
         write(axes, 0.56, 0.94 - 0.12 * k, f"new {condition}", GREY, SMALL, ha="left")
-        for limit in stranger_limits.COSTS:
-            x, y = of[limit][0]
+        points = sorted((*of[limit][0], limit) for limit in stranger_limits.COSTS)
+        at_x, at_y = 0.0, 0.0
+        for x, y, limit in points:
             axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
             if condition == highest:
-                write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
+                meets = x - at_x < NAME[0] and abs(y + 0.05 - at_y) < NAME[1]
+                at_x, at_y = x, at_y + NAME[1] if meets else y + 0.05
+                write(axes, x, at_y, limit, GREY, SMALL, ha="right")
     axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
     axes.set_ylim(0, 1.05)
     set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)
