@@ -296,7 +296,8 @@ def test_a_sweep_with_the_wrong_material_is_moved(browser: Any, recorded: Record
     until(lambda: seen.text("#outcome").startswith("wood at 1, stored"))
     assert not seen.page.is_visible("#move")
     assert not seen.page.is_visible("#undo")
-    seen.page.click("#counts button >> nth=0")  # metal at 1
+    seen.page.click("#counts button >> nth=0")
+    until(lambda: seen.text("#said") == "now metal at 1")
     seen.page.click(f"#move{PRESS}")
     until(lambda: seen.text("#outcome").startswith("metal at 1, stored"))
     assert recorded.recording.materials() == {"metal": 8, "wood": 1}
@@ -309,6 +310,16 @@ def test_a_sweep_with_the_wrong_material_is_moved(browser: Any, recorded: Record
         seen.page.click(f"#undo{PRESS}")
         until(lambda left=left: recorded.recording.materials() == left)
     until(lambda: not seen.page.is_visible("#undo"))
+    assert not seen.errors
+
+
+def test_a_press_before_the_answer_to_another_is_said(browser: Any, recorded: RecordedPage):
+    """It is lost, and the page says so once the first is answered."""
+    seen = opened(browser, recorded)
+    both = "[...document.querySelectorAll('#counts button')].slice(0, 2)"
+    seen.page.evaluate(f"() => {{ for (const one of {both}) one.click(); }}")
+    until(lambda: seen.text("#said").startswith("a press was ignored"))
+    assert seen.text("#now") == "metal at 1"
     assert not seen.errors
 
 

@@ -6,7 +6,7 @@ import {ago, byId, call, enable, frame, listenToPedal, order, put} from "./parts
 /* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
    finished: the person has ended the program, so that no connection is no fault. dirty: something is to be drawn. */
 export const seen = {finished: false, key: "", role: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
-let program = "", ordering = false;
+let program = "", ordering = false, early = "";
 
 function begin() { Object.assign(seen, {finished: false, key: "", recording: null, last: null}); }
 
@@ -81,14 +81,16 @@ async function fetchPicture(sweep) {
   seen.dirty = true;
 }
 
-/* Does `act` with a function that sends one order and gives why it was refused, "" where it was not; one `act` at a time. */
+/* Does `act` with a function that sends one order and gives why it was refused, "" where it was not; one `act` at a time:
+   a press before its end is refused, and said then. */
 export async function ordered(act) {
-  if (ordering) return "the order before is not answered yet";
+  if (ordering) return early = "a press was ignored: the order before it was not answered yet";
   ordering = seen.dirty = true;
   try {
     return await act((command, text) => order(program, seen.key, command, text));
   } finally {
-    ordering = false;
+    if (early) put("said", early);
+    [ordering, early] = [false, ""];
     seen.dirty = true;
   }
 }
