@@ -125,6 +125,10 @@ class TeachingSession(Observer):
         counts = {name: n for name, n in counts.items() if name not in self._trained}
         return dict.fromkeys(self._named, 0) | counts
 
+    def taken(self, material: str) -> int:
+        """The number of its sweeps that count, those that are still being written included."""
+        return self.materials().get(material, 0) + self._recording.coming(material)
+
     def _taught(self) -> dict[str, int]:
         """`materials` that an answer may name."""
         return {name: n for name, n in self.materials().items() if name != NOT_THIS}
@@ -237,7 +241,7 @@ class TeachingSession(Observer):
         if now["material"] not in ("", label) and now["position"].isdecimal():
             self._recording.commands["POSITION"](self._place)  # each material begins there
         self._recording.commands["MATERIAL"](label)
-        return [label, self.materials().get(label, 0) + self._recording.coming(label)]
+        return [label, self.taken(label)]
 
     def _material(self, label: str) -> Reply:
         self.admit(*filter(None, [label.strip()]))
@@ -291,14 +295,13 @@ class TeachingSession(Observer):
     def _forget(self, label: str) -> Reply:
         """Teach a material no longer; returns it and the number of its sweeps."""
         label = label.strip()
-        coming = self._recording.coming(label)
-        if label not in self.materials() and not coming:
+        number = self.taken(label)
+        if label not in self.materials() and not number:
             raise ApplianceError(
                 f"there is no material {label!r} to forget; name one that was recorded"
             )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
-        number = self.materials().get(label, 0) + coming
         return self._recording.forget(label, partial(self._forgotten, label, number))
 
     def _forgotten(self, label: str, number: int) -> list[object]:
@@ -339,7 +342,9 @@ class Teacher(Observer):
         if (not self._left and not self._wanted) or self._lacks([*self._wanted][-1:]):
             return
         if self._left:
-            self._ask(self._left.pop(0))
+            label = self._left.pop(0)
+            self._wanted[label] = self._session.taken(label) + self._sweeps
+            self._ask(label)
             return
         self._recording.settle()
         if again := self._lacks(self._wanted):
@@ -348,17 +353,11 @@ class Teacher(Observer):
             self.done = True
 
     def _ask(self, label: str) -> None:
-        held = self._session.materials().get(label, 0)
-        wanted = self._wanted.pop(label, held + self._sweeps)
-        self._wanted[label] = wanted
+        self._wanted[label] = wanted = self._wanted.pop(label)  # the last in hand
         self._session.commands["TEACH"](label)
-        log.info(f"teach: now {label}: {wanted - held} sweeps")
+        log.info(f"teach: now {label}: {wanted - self._session.taken(label)} sweeps")
 
     def _lacks(self, labels: Iterable[str]) -> list[str]:
         """Those of the labels that want more sweeps; not one that was forgotten, or renamed."""
-        held, coming = self._session.materials(), self._recording.coming
-        return [
-            label
-            for label in labels
-            if label in held and held[label] + coming(label) < self._wanted[label]
-        ]
+        named, taken = self._session.materials(), self._session.taken
+        return [one for one in labels if one in named and taken(one) < self._wanted[one]]

@@ -452,6 +452,19 @@ def test_the_teacher_asks_again_for_a_sweep_that_could_not_be_stored(tmp_path, m
     one.recording.close()
 
 
+def test_the_teacher_asks_for_a_label_as_often_as_it_is_named(taught):
+    """A label that is named again gets as many sweeps again."""
+    teacher = Teacher(taught.session, taught.recording, ["cork", "pine", "cork"], 1)
+    for material in ("cork", "pine", "cork"):
+        teacher.turn(HEALTH)
+        assert not teacher.done
+        assert taught.recording.about()["material"] == material
+        taught.sweeps(material, 1)
+    teacher.turn(HEALTH)
+    assert teacher.done
+    assert taught.session.materials() == {"cork": 2, "pine": 1}
+
+
 @pytest.mark.parametrize("order", [("FORGET", "cork"), ("RENAME", "cork,oak")])
 def test_the_teacher_goes_on_from_a_material_that_is_gone(taught, order: tuple[str, str]):
     """A label that a person has forgotten or renamed holds up none of the others."""
