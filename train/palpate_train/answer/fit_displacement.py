@@ -22,6 +22,7 @@ from palpate.answer.unknown import Classes, DisplacedClasses
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import Embedding, embed, limit
+from palpate_train.answer.rule import Rule
 from palpate_train.data.augment import Augmentation, augment
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics import tolerances
@@ -167,4 +168,4 @@ def without(bundle: Bundle) -> Bundle:
     return replace(bundle, manifest=replace(bundle.manifest, displacement=None), classes=classes)
 
 
-RULES = {"displacement": ("a rule for displaced contacts", without, True, limited)}
+RULES = {"displacement": Rule("a rule for displaced contacts", without, limited=limited)}

@@ -19,6 +19,7 @@ from palpate.bundle.contents import Bundle
 from palpate.core.types import SweepFormat
 from palpate_train.answer import fit_hum
 from palpate_train.answer.fit_unknown import DisturbedSweeps
+from palpate_train.answer.rule import Rule
 from palpate_train.metrics.tolerances import KEPT_COPIES, MARGIN, OUTER
 
 Array = NDArray[Any]
@@ -281,6 +282,6 @@ def without(bundle: Bundle) -> Bundle:
 
 
 RULES = {
-    "disturbance": ("allowances for disturbances", without),
-    "hum": ("hum removal", fit_hum.without),
+    "disturbance": Rule("allowances for disturbances", without),
+    "hum": Rule("hum removal", fit_hum.without),
 }

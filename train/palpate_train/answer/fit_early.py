@@ -21,6 +21,7 @@ from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import JudgingPart, centred, limit
 from palpate_train.answer.heads import ABSENT, shrinkage
+from palpate_train.answer.rule import Rule
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import sufficient_temperature
 from palpate_train.metrics.tolerances import LOST
@@ -267,4 +268,4 @@ def without(bundle: Bundle) -> Bundle:
     return replace(bundle, manifest=replace(bundle.manifest, early=None), classes=classes)
 
 
-RULES = {"early": ("early answers", without, False)}
+RULES = {"early": Rule("early answers", without, tried=False)}

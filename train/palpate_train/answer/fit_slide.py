@@ -15,6 +15,7 @@ from palpate.answer.vibration import PARTS, SlideLimits, vibration
 from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
+from palpate_train.answer.rule import Rule
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.tolerances import MARGIN, OUTER
 
@@ -117,6 +118,6 @@ def _limits(bundle: Bundle, **changed: Any) -> Bundle:
 
 
 RULES = {
-    "vibration": ("a least vibration of slides", without_vibration),
-    "slide": ("a least pattern of slides", without_pattern, True, limited),
+    "vibration": Rule("a least vibration of slides", without_vibration),
+    "slide": Rule("a least pattern of slides", without_pattern, limited=limited),
 }

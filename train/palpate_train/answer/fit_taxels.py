@@ -27,6 +27,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import ModelRunner
+from palpate_train.answer.rule import Rule
 from palpate_train.data.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
@@ -356,4 +357,4 @@ def without(bundle: Bundle) -> Bundle:
     return replace(bundle, manifest=replace(bundle.manifest, bridging=None))
 
 
-RULES = {"taxels": ("bridging of broken taxels", without)}
+RULES = {"taxels": Rule("bridging of broken taxels", without)}

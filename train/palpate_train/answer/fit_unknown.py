@@ -28,6 +28,7 @@ from palpate_train.answer.embedding import (
     shapes_of,
     within,
 )
+from palpate_train.answer.rule import Rule
 from palpate_train.data.thinning import evenly
 from palpate_train.metrics.tolerances import LEFT_OUT
 
@@ -278,4 +279,4 @@ def without(bundle: Bundle) -> Bundle:
     return replace(bundle, manifest=manifest, classes=None)
 
 
-RULES = {"unknown": ("detection of unknown materials", without, False)}
+RULES = {"unknown": Rule("detection of unknown materials", without, tried=False)}

@@ -6,7 +6,7 @@ Export, score and card use this table. A bundle holds the rules that pay on the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,26 +16,13 @@ from palpate.answer.rules import Rules
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.errors import FormatError
-from palpate_train.data.sets import Dataset
+from palpate_train.answer.rule import Rule
 
 FIGURES = "rules"
 """Key of the figures in a manifest."""
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A rule that a bundle may lack. what: for people. without: makes a bundle without it; the same
-    bundle if it has none. tried: whether recordings can show that it is not needed; no recording
-    shows a material that was not taught, and an early answer saves time alone. limited: a manifest
-    with its limits, from the counts of training sweeps."""
-
-    what: str
-    without: Callable[[Bundle], Bundle]
-    tried: bool = True
-    limited: Callable[[Manifest, Dataset], Manifest] = lambda manifest, train: manifest
-
-
-def _twins() -> Iterator[Mapping[str, tuple[Any, ...]]]:
+def _twins() -> Iterator[Mapping[str, Rule]]:
     """The `RULES` of the twin of each module that has parameters of the box."""
     for hint in get_type_hints(Rules).values():
         name = f"{__package__}.fit_{get_args(hint)[0].__module__.rpartition('.')[2]}"
@@ -43,7 +30,7 @@ def _twins() -> Iterator[Mapping[str, tuple[Any, ...]]]:
             yield getattr(import_module(name), "RULES", {})
 
 
-RULES = {name: Rule(*about) for twin in _twins() for name, about in twin.items()}
+RULES = {name: rule for twin in _twins() for name, rule in twin.items()}
 
 
 @dataclass(frozen=True)
