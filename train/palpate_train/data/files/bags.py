@@ -18,6 +18,7 @@ from palpate_train.data.files.table import (
     Array,
     ReadPlan,
     Table,
+    asked_topics,
     from_columns,
     labelled,
     normal,
@@ -68,7 +69,7 @@ def read(path: Path, wanted: ReadPlan) -> Table:
             topics.setdefault(normal(connection.topic), []).append(connection)
         types = {name: connections[0].msgtype for name, connections in topics.items()}
         name = only("topic", types, wanted.variable, lambda n: _fits(bag, topics[n]))
-        labels = {n: topics[at] for n in wanted.fields for at in (n, f"/{n}") if at in topics}
+        labels = {n: topics[at] for n, at in asked_topics(topics, wanted).items()}
         return _table(bag, topics[name], labels)
 
 

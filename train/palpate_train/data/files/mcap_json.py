@@ -14,7 +14,7 @@ from palpate.core.errors import FormatError
 from palpate.core.text import printable
 from palpate_train.data.extras import library
 from palpate_train.data.files.json_lines import flat, table_of
-from palpate_train.data.files.table import ReadPlan, Table, labelled, normal, only
+from palpate_train.data.files.table import ReadPlan, Table, asked_topics, labelled, normal, only
 
 JSON = "json"
 MAGIC_BYTES = 8
@@ -54,8 +54,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         vectors={TIME: 1e-9 * (np.array(at_ns) - at_ns[0])},
         beside=(TIME,),
     )
-    asked = {n: at for n in wanted.fields for at in (n, f"/{n}") if at in topics}
-    said = {n: _texts(at, topics[at]) for n, at in asked.items()}
+    asked = asked_topics(topics, wanted).items()
+    said = {n: _texts(at, topics[at]) for n, at in asked}
     return labelled(table, at_ns, said)
 
 

@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -297,6 +297,11 @@ def from_columns(
     for i, (_, column) in enumerate(columns):
         values[:, i] = 0 if i in texts else column
     return Table(values, tuple(names), texts=texts, faults=faults or {}, notes=tuple(notes))
+
+
+def asked_topics(topics: Container[str], wanted: ReadPlan) -> dict[str, str]:
+    """The topics of a recording that are wanted as fields, with or without their first slash."""
+    return {n: at for n in wanted.fields for at in (n, f"/{n}") if at in topics}
 
 
 def labelled(

@@ -289,7 +289,7 @@ def finished(fit: Fit, known: HeadData | None = None, displaced: bool = True) ->
     enough for its early answers. known, displaced: as for `calibration_inputs`."""
     fit = replace(fit, contacts=fit.contacts or Contacts.of(fit.train), calibration=None)
     try:
-        early = not no_limits(len(fit.held))
+        early = no_limits(len(fit.held)) is None
         given = calibration_inputs(fit, known, early, displaced)
         calibration = fit_calibration(given)
     except FormatError as e:  # nothing was held out, or of too few groups

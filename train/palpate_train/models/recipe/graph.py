@@ -138,8 +138,7 @@ class _TrunkNodes:
         self._rowwise = prefixes and not self._zero_sum
         # a byte does not hold wider counts: fixed features of these stay in float (decision 4)
         self._own = ranges if format.dtype == "uint8" else None
-        shape = [1, format.window, format.channels]
-        self.raw = self.g("Reshape", "sweep", shape)
+        self.raw = self.g("Reshape", "sweep", [1, format.window, format.channels])
         self.attenuation = self._attenuation()
         self._prepared: dict[Ranges | None, Prepared] = {}
 
@@ -269,8 +268,7 @@ class _TrunkNodes:
         """Attenuated raw counts [1, T, R * C] as bytes; exact where the factor is 1."""
         g, format, scale = self.g, self._format, self._scale
         factors = graph_builder.quantized(g, self.attenuation, 1 / 255)
-        shape = [1, format.window, format.channels]
-        factors = g("Expand", factors, shape)
+        factors = g("Expand", factors, [1, format.window, format.channels])
         counts = graph_builder.counts_of(g, self.raw, scale)
         product = g("Mul", counts, graph_builder.counts_of(g, factors, 1 / 255))
         return graph_builder.quantized(g, product, scale)
