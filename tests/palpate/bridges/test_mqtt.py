@@ -7,7 +7,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -270,23 +270,30 @@ def test_a_broker_that_takes_small_packets_alone(tmp_path, box, caplog):
     assert one.last("/config") == ""
 
 
-def test_a_broker_that_takes_few_messages_at_a_time(box):
-    """No more are under way than it allows; it would end the connection."""
+@contextmanager
+def other_broker(box: SpeakingBox, silent_s: float) -> Iterator[socket.socket]:
+    """A bridge's connection to a broker that the test plays, after the packet that opens it."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         other.settimeout(LONG_S)
         url = f"mqtt://127.0.0.1:{other.getsockname()[1]}"
         with bridge("mqtt", "--port", str(box.path), "--broker", url):
             line, _ = other.accept()
             with line:
-                line.settimeout(0.5)
+                line.settimeout(silent_s)
                 assert line.recv(4096)[0] == 0x10
-                for number in range(20):
-                    box.say(state(), result(number))
-                line.sendall(bytes([0x20, 6, 0, 0, 3, 0x21, 0, 2]))  # Receive Maximum 2
-                sent = b""
-                with suppress(TimeoutError):
-                    while more := line.recv(65536):
-                        sent += more
+                yield line
+
+
+def test_a_broker_that_takes_few_messages_at_a_time(box):
+    """No more are under way than it allows; it would end the connection."""
+    with other_broker(box, 0.5) as line:
+        for number in range(20):
+            box.say(state(), result(number))
+        line.sendall(bytes([0x20, 6, 0, 0, 3, 0x21, 0, 2]))  # Receive Maximum 2
+        sent = b""
+        with suppress(TimeoutError):
+            while more := line.recv(65536):
+                sent += more
     assert published(sent) == 2
 
 
@@ -299,17 +306,10 @@ def test_a_broker_that_takes_few_messages_at_a_time(box):
 )
 def test_a_broker_that_would_fill_the_memory(box, caplog, begin, why):
     """A message of 256 MiB, or one that waits for an acknowledgement, ends the connection."""
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        other.settimeout(LONG_S)
-        url = f"mqtt://127.0.0.1:{other.getsockname()[1]}"
-        with bridge("mqtt", "--port", str(box.path), "--broker", url):
-            line, _ = other.accept()
-            with line:
-                line.settimeout(LONG_S)
-                assert line.recv(4096)[0] == 0x10
-                line.sendall(bytes([0x20, 3, 0, 0, 0]) + begin)
-                eventually(lambda: why in caplog.text)
-                assert "Traceback" not in caplog.text
+    with other_broker(box, LONG_S) as line:
+        line.sendall(bytes([0x20, 3, 0, 0, 0]) + begin)
+        eventually(lambda: why in caplog.text)
+        assert "Traceback" not in caplog.text
 
 
 @pytest.mark.slow
