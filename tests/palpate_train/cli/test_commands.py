@@ -1,6 +1,7 @@
 """The command palpate-train: options, messages and exit codes."""
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -193,6 +194,19 @@ def test_signing_does_without_the_imports_of_training():
     assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {
         *done.stdout.split()
     }
+
+
+def test_a_command_computes_on_one_thread():
+    """Beside it, threads of OpenBLAS would only wait, and sum in another order elsewhere."""
+    code = (
+        "import os; from palpate_train.cli.main import main; main(['sets']);"
+        "import numpy; print(len(os.listdir('/proc/self/task')))"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=env, timeout=120
+    )
+    assert done.stdout.splitlines()[-1] == "1", done.stderr
 
 
 def few(tmp_path: Path) -> Path:

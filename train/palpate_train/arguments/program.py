@@ -57,6 +57,9 @@ class Program:
         """Run one command; its exit code. An error of this project is a line on standard error."""
         words = sys.argv[1:] if argv is None else list(argv)
         replace_unprintable()
+        # OpenBLAS would start a thread for each core. They spend as much of a processor again in
+        # waiting for one another, and their sums differ from machine to machine.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         args = argparse.Namespace()
         try:
             with during_imports(self.name):

@@ -22,6 +22,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import _check_sample_weight as check_sample_weight
 from sklearn.utils.validation import check_is_fitted, validate_data
+from threadpoolctl import threadpool_limits
 
 from palpate.answer.objects import softmax
 from palpate.bundle.manifest import Manifest
@@ -139,7 +140,8 @@ class PalpateClassifier(
         varies = (self.varies,) if isinstance(self.varies, str) else tuple(self.varies)
         settings = recipe.Settings(self.steps, size=size, use=use, calibrate=False, varies=varies)
         seen = replace(sweeps.require_materials(), samples=held(sweeps.samples))
-        self.fit_ = recipe.fit(seen, Run(self._seed()), settings)
+        with threadpool_limits(1):  # as in the command
+            self.fit_ = recipe.fit(seen, Run(self._seed()), settings)
         self.sweeps_, self.format_ = sweeps, sweeps.format
         self.model_ = _graph(self.fit_)
         self._runner = ModelRunner(self.model_, "logits")
