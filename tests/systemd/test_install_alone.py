@@ -173,23 +173,47 @@ CHANGES: dict[str, tuple[Callable[[Path], object], int]] = {
 }
 
 
+def checked(release: Path, signers: str) -> subprocess.CompletedProcess[str]:
+    """Run the check of an unpacked release on a box with these signers."""
+    file = release.parent / "signers"
+    file.write_text(signers)
+    script = run_here(
+        f"import install; print(install.check_signature({str(release)!r}, {str(file)!r}))"
+    )
+    return subprocess.run(
+        ["sh", "-ec", script], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
 @pytest.mark.slow
 @deliveries.NEEDED
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_box_installs_what_a_signer_of_it_has_signed(tmp_path: Path, what: str):
     """Every file of the archive, and no other file."""
     key = deliveries.key(tmp_path / "keys")
-    (tmp_path / "signers").write_text(deliveries.line(key))
     release = unpacked(tmp_path, key)
     change, code = CHANGES[what]
     change(release)
-    script = run_here(
-        f"import install; print(install.check_signature({str(release)!r}, "
-        f"{str(tmp_path / 'signers')!r}))"
-    )
-    done = subprocess.run(["sh", "-ec", script], capture_output=True, text=True, timeout=120)
+    done = checked(release, deliveries.line(key))
     assert done.returncode == code, done.stderr
     assert bool(done.stderr) == bool(code)
+
+
+@pytest.mark.slow
+@deliveries.NEEDED
+@pytest.mark.parametrize(
+    ("uses", "code"),
+    [(("bundle", "release"), 0), (("release", "bundle"), 0), (("bundle", "bundle"), 1)],
+)
+def test_the_order_of_two_lines_of_a_key_does_not_matter(
+    tmp_path: Path, uses: tuple[str, str], code: int
+):
+    """One of them has to allow releases."""
+    key = deliveries.key(tmp_path / "keys")
+    _, of = deliveries.line(key).split(" ", 1)
+    each = zip(("anna", "anna-too"), uses, strict=True)
+    signers = "".join(f'{name} namespaces="palpate-{use}" {of}' for name, use in each)
+    assert checked(unpacked(tmp_path, key), signers).returncode == code
 
 
 @pytest.mark.slow
