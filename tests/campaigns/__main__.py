@@ -233,7 +233,7 @@ CAMPAIGNS = {
         nice=True,
     ),
     "install-cuts": _module(
-        "cut the power of a host while it is installed or delivered to (as root; 40 minutes)",
+        "cut the power of a host that is installed, delivered to or taught (as root; an hour)",
         "tests.campaigns.install_cuts",
         prepare=containers,
     ),

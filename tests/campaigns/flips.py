@@ -15,11 +15,11 @@ import json
 import platform
 import random
 import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate.deployment import signature
 from palpate.deployment.enrolment_key import KEY
+from tests.cuts.scene import stage
 from tests.factories import deliveries, install_scripts
 from tests.factories.deliveries import Delivery
 
@@ -36,6 +37,8 @@ Files = dict[str, bytes]
 Case = tuple[str, str, Files]
 """An alteration: its kind, a description, and the files."""
 FLIPS = 1000
+PLAIN: dict[str, Any] = {"figures": {}, "made": {}}
+"""The bundles have no figures and no history: two thirds of a manifest, which a box only shows."""
 ENROLLED = "enrolled: "
 """Prefix of the kinds of alterations of a bundle with an enrolled label."""
 FLIPPED = f"a bit of {bundle.MANIFEST} flipped"
@@ -74,7 +77,7 @@ def without(files: Files, name: str) -> Files:
 
 def another(key: Path) -> Files:
     """A bundle that shares no file with the default; its weights differ slightly."""
-    held = deliveries.files(4, None)
+    held = deliveries.files(4, None, **PLAIN)
     model = bytearray(held[bundle.MODEL])
     model[len(model) // 2] ^= 1
     held[bundle.MODEL] = bytes(model)
@@ -90,7 +93,7 @@ def enrolled(box: Delivery, bits: int | None, seed: int) -> Iterator[Case]:
     """All alterations of a bundle into which the box has enrolled a label."""
     one, other = (
         deliveries.enrolled(made, box.enrolment_key)
-        for made in (deliveries.files(3, box.key), another(box.key))
+        for made in (deliveries.files(3, box.key, **PLAIN), another(box.key))
     )
     parts = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
     yield "not signed", "", without(one, bundle.ENROLMENT_SIGNATURE)
@@ -141,7 +144,7 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
 
 def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
     """All alterations. manifest_bits: number of drawn bits of its manifest, None for all."""
-    good, other = deliveries.files(3, box.key), another(box.key)
+    good, other = deliveries.files(3, box.key, **PLAIN), another(box.key)
     assert not any(good[name] == other[name] for name in good)
     yield from others(good, box)
     yield from swaps(good, other)
@@ -217,7 +220,7 @@ def main() -> int:
         "--bits", type=int, help="flip this many random bits of the manifest (all of them)"
     )
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
+    with stage() as folder:
         found = campaign(Path(folder), args.bits, args.seed, every=1000)
     total = {
         name: sum(count[name] for count in found.values())

@@ -205,6 +205,15 @@ def wheel(out: Path, source: Path) -> None:
     run(*PIP, "wheel", "--no-deps", "-w", out, source)
 
 
+def wheels(out: Path, source: Path) -> tuple[Path, Path]:
+    """Build the wheels of palpate and palpate-train, as `wheel` does; both."""
+    wheel(out, source)
+    shutil.copytree(ROOT / "train", source / "train", ignore=shutil.ignore_patterns("build"))
+    run(*PIP, "wheel", "--no-deps", "-w", out, source / "train")
+    box, train = sorted(out.glob("palpate*.whl"))
+    return box, train
+
+
 def run(*args: str | Path) -> str:
     """The output of a command. If it fails, its errors are in the exception."""
     return subprocess.run(args, check=True, capture_output=True, text=True, timeout=1800).stdout

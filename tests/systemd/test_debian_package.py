@@ -17,7 +17,6 @@ from pathlib import Path
 import pytest
 
 from tests.factories.install_scripts import SCRIPTS, require_pyinfra
-from tests.factories.paths import ROOT
 from tests.rig import emulated_machines
 from tests.systemd import hosts
 from tests.systemd.nspawn import PALPATE, SITE, WAIT_S
@@ -36,11 +35,7 @@ LONG_S = 900
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The wheels of palpate and palpate-train."""
     folder, source = (tmp_path_factory.mktemp(name) for name in ("wheels", "source"))
-    emulated_machines.wheel(folder, source)
-    shutil.copytree(ROOT / "train", source / "train", ignore=shutil.ignore_patterns("build"))
-    pip = emulated_machines.PIP
-    emulated_machines.run(*pip, "wheel", "--no-deps", "-w", folder, source / "train")
-    return sorted(folder.glob("*.whl"))
+    return [*emulated_machines.wheels(folder, source)]
 
 
 def packed(folder: Path, wheels: list[Path], *architectures: str) -> list[Path]:
