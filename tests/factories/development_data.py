@@ -31,7 +31,7 @@ def timed(method: str, ms: float, precision: str = "float", form: str = "") -> d
 def times(*entries: dict[str, Any]) -> dict[str, Any]:
     """The times of one run."""
     made = {"set": "sim:T-REAL:1", "format": "4x4 uint8 at 750 Hz, window 1500"}
-    made |= {"processor": "a processor", "left_out": {}, "box": {"ms_p50": 0.7, "ms_p99": 1.2}}
+    made |= {"processor": "a processor", "left_out": {}}
     return made | {"entries": list(entries)}
 
 
@@ -46,7 +46,8 @@ def figures(**changes: Any) -> dict[str, Any]:
         if mean is not None
     ]
     run = {"methods": names, "seeds": [1, 2], "effort": 1.0}
-    costs = timed("palpate", 0.1, "int8"), timed("quant", 22.0), timed("minirocket", 10.0)
+    ours = timed("palpate", 0.1, "int8") | {"answer_ms": 0.7}
+    costs = ours, timed("quant", 22.0), timed("minirocket", 10.0)
     made = {
         "methods": names,
         "runs": [run | {"commit": "0123abcd", "machine": "x86_64, 2 cores"}],

@@ -18,7 +18,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.export.quantized_bundle import export
 from palpate_train.metrics import bundle_score
 from palpate_train.models.methods import Model
-from palpate_train.models.recipe.fitted import FittedModel, finished
+from palpate_train.models.recipe.fitted import Fit, FittedModel, finished
 
 Array = NDArray[Any]
 
@@ -28,14 +28,18 @@ def answers(model: Model, sweeps: Dataset) -> tuple[Array, Array] | None:
     model that is not a fit. Raises FormatError or BundleError if export refuses the model."""
     if not isinstance(model, FittedModel):
         return None
-    fit, own = model.fit, model.fit.train.materials
-    # names that any bundle may have: they change no answer
-    names = tuple(f"m{number}" for number in range(len(own)))
-    sides = {side: replace(getattr(fit, side), materials=names) for side in ("train", "held")}
+    own = model.fit.train.materials
     with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "bundle"
-        export(finished(replace(fit, **sides)), target, "fold", "1", commit(), proven=False)
+        pack(model.fit, target := Path(folder) / "bundle")
         classifier = Classifier(bundle.load(target), SystemClock())
         found, sure = bundle_score.labels_of(classifier, sweeps)
     labels = [sweeps.materials.index(own[k]) if k >= 0 else int(k) for k in found]
     return np.array(labels, int), sure
+
+
+def pack(fit: Fit, target: Path) -> None:
+    """Calibrate `fit` and export it with all rules of the answer. Its materials get names that any
+    bundle may have: they change no answer. Raises FormatError or BundleError if export refuses."""
+    names = tuple(f"m{number}" for number in range(len(fit.train.materials)))
+    sides = {side: replace(getattr(fit, side), materials=names) for side in ("train", "held")}
+    export(finished(replace(fit, **sides)), target, "fold", "1", commit(), proven=False)

@@ -24,6 +24,8 @@ Accuracies = Mapping[str, Json]
 """Entries of one case by method."""
 UNIT = "minirocket"
 """The method whose time is 1."""
+ANSWER = "answer_ms"
+"""Key of the median time of the box's whole answer, which peers do not have."""
 LEAST_SHARE = 0.5
 """A method is on a panel if it was run in this share of its tests."""
 PROTOCOLS = {
@@ -70,7 +72,8 @@ class Spot:
     """A method in one precision on a panel.
 
     form: "" for the method itself, else the name of its other precision. ms: median time of a
-    sweep. accuracy: the mean over the tests that it was run in. lacks: names of the others.
+    sweep, of ours as the box answers it. accuracy: the mean over the tests that it was run in.
+    lacks: names of the others. alone: the time of features and network.
     """
 
     method: str
@@ -79,6 +82,7 @@ class Spot:
     ms: float
     accuracy: Estimate
     lacks: tuple[str, ...] = ()
+    alone: float | None = None
 
     @property
     def mean(self) -> float:
@@ -177,10 +181,11 @@ def _spots(
     timed: Iterable[Json], table: Mapping[str, Accuracies], cases: Sequence[Json]
 ) -> list[Spot]:
     """A spot for each timed form with an accuracy in enough of the cases, in the library in which
-    it is quickest."""
+    it is quickest. A form of ours that does not ship has no whole answer, and no spot."""
     forms: dict[tuple[str, str], Json] = {}
-    for one in sorted(timed, key=lambda one: float(one["ms_p50"])):
-        forms.setdefault((one["method"], one.get("form", "")), one)
+    for one in sorted(timed, key=answer_ms):
+        if not (one["method"] in OURS and one["form"]):
+            forms.setdefault((one["method"], one["form"]), one)
     sets = {case["case"]: case["set"] for case in cases}
     found = []
     for (method, form), one in forms.items():
@@ -192,8 +197,14 @@ def _spots(
         if entries and len(entries) >= LEAST_SHARE * len(sets):
             lacks = tuple(case for case in sets if case not in entries)
             middle = mean(entries, sets)
-            found.append(Spot(method, form, one["precision"], one["ms_p50"], middle, lacks))
+            about = method, form, one["precision"], answer_ms(one), middle, lacks
+            found.append(Spot(*about, one["ms_p50"] if ANSWER in one else None))
     return found
+
+
+def answer_ms(one: Json) -> float:
+    """Median time of a sweep in ms: the whole answer of the box, or what a peer computes."""
+    return float(one.get(ANSWER, one["ms_p50"]))
 
 
 def _form(entry: Json | None, form: str) -> Json | None:
@@ -244,7 +255,7 @@ def quickest(times: Iterable[Json]) -> dict[str, float]:
     quickest."""
     ms: dict[str, float] = {}
     for one in times:
-        ms[one["method"]] = min(float(one["ms_p50"]), ms.get(one["method"], np.inf))
+        ms[one["method"]] = min(answer_ms(one), ms.get(one["method"], np.inf))
     return ms
 
 

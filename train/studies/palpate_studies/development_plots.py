@@ -62,7 +62,7 @@ def speed(panels: Sequence[ChartPanel], machine: str, plain: bool = False) -> st
     machine: processor and threads, in words. plain: in fixed colours, for a viewer of Markdown, and
     with the methods of FEW alone.
     """
-    spots = [spot.ms for panel in panels for spot in panel.spots]
+    spots = [ms for panel in panels for spot in panel.spots for ms in (spot.ms, spot.alone) if ms]
     ends = min(spots) / 1.7, max(spots) * 1.7
     said = ("" if plain else _below(panels), _gaps(panels, plain), machine)
     lines = [
@@ -121,7 +121,7 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float], few: bool) 
     set_ticks(axes.xaxis, tens or [float(f"{ends[0]:.1g}")], "ms")
     set_ticks(axes.yaxis, round_ticks(low - room, high + room, 6), percent=True)
     shape, frames = panel.sweep.partition(" ")[0], panel.sweep.rpartition(" ")[2]
-    timed = f"← faster: processor time of a sweep of {shape} taxels, {frames} frames"
+    timed = f"← faster: time of the whole answer to {shape} taxels, {frames} frames"
     axes.set_xlabel(timed, color=GREY, size=SMALL, labelpad=3)
     about = f"classified correctly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
@@ -149,8 +149,7 @@ def _marks(axes: Axes, panel: ChartPanel, few: bool) -> Iterator[Label]:
     """Draw the spots; yield their names, the most important first. All forms of a method have the
     same name."""
     names: dict[str, str] = {}
-    shown = [s for s in panel.spots if not (s.method in OURS and s.form) or s in panel.front]
-    shown = [s for s in shown if s.method in FEW and not s.form] if few else shown
+    shown = [s for s in panel.spots if not few or (s.method in FEW and not s.form)]
     bottom, _ = _ends(panel)
     for spot in shown:
         y, mark = max(spot.mean, bottom), MARKERS[spot.precision]
@@ -159,6 +158,8 @@ def _marks(axes: Axes, panel: ChartPanel, few: bool) -> Iterator[Label]:
         face = WHITE if spot.lacks else shade
         look: dict[str, Any] = {"markeredgecolor": shade, "markerfacecolor": face, "clip_on": False}
         axes.plot(spot.ms, y, mark, markersize=5.5, zorder=4, **look)
+        if spot.alone:
+            axes.plot(spot.alone, y, "|", markersize=5.5, color=shade, clip_on=False)
         if spot.method == PACKAGED and not spot.form:
             axes.plot(spot.ms, y, **RING)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))

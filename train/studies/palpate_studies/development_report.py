@@ -13,6 +13,7 @@ import numpy as np
 from palpate.core.errors import FormatError
 from palpate_studies import TEMPLATES, comparison, development_plots, differences
 from palpate_studies.development_chart import (
+    ANSWER,
     Accuracies,
     ChartPanel,
     Json,
@@ -119,7 +120,6 @@ def _costs(figures: Json, table: Mapping[str, Accuracies], names: Sequence[str])
     times = _times(figures)
     return {
         "times": times,
-        "box": times.get("box"),
         "machine": machine(figures),
         "relative": relative_times(times["entries"], names),
         "costs": [_cost(one) for one in times["entries"]],
@@ -131,7 +131,7 @@ def _cost(one: Json) -> list[str]:
     """A row of the table of costs."""
     counts = [f"{one[key]:,}" if one.get(key) else "–" for key in ("weights", "macs")]
     sizes = [amount(one[key], unit) if one.get(key) else "–" for key, unit in SIZES_OF]
-    times = [amount(one[key], "ms") for key in ("ms_p50", "ms_p99")]
+    times = [amount(one[key], "ms") if key in one else "–" for key in ("ms_p50", "ms_p99", ANSWER)]
     name = plain_name(one["method"])
     return [name, one["precision"], one["runtime"], *times, *counts, *sizes]
 

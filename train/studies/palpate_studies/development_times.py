@@ -1,8 +1,8 @@
 """Costs of a sweep with each method, all timed in turns in one process.
 
 Features and graph are timed in a session like the box's, a method without a graph in its own
-library. The box checks every sweep before that, whatever the model; `box` has the time of the
-packaged bundle with these checks.
+library. A bundle of ours is timed as the box answers, too: with its checks of the sweep and the
+rules of the answer, which a peer does not have.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer import features
-from palpate.bundle import bundle
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.provenance import processor
 from palpate.inference.session import session
 from palpate_studies import cost, precisions
-from palpate_studies.development_chart import SERIES, TACTILE
+from palpate_studies.development_chart import ANSWER, SERIES, TACTILE
 from palpate_studies.development_experiment import CASES, OURS
 from palpate_studies.precisions import Packed
 from palpate_studies.study import StudyCase
@@ -36,6 +35,8 @@ from palpate_train.models.methods import FULL_EFFORT, Effort, Method, model_inpu
 Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
+Timed = tuple[Json, measure.Call | None, measure.Call]
+"""The costs of a model, its whole answer if it is of ours, and its features and graph."""
 TIMED = StudyCase(("sim:T-REAL/level-blind:1",))
 """The sweeps that every method is trained on and timed with."""
 PANELS = {
@@ -44,7 +45,7 @@ PANELS = {
 }
 """For each panel of the chart the sweeps with which its methods are timed. Which views a model of
 ours has, and so its time, depends on the sweeps."""
-CHARTED = ("method", "form", "precision", "ms_p50")
+CHARTED = ("method", "form", "precision", "ms_p50", ANSWER)
 """The keys of an entry that the chart reads."""
 ROUNDS = 10
 """Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
@@ -52,8 +53,6 @@ EVERY, SHARE = 5, 0.25
 """A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
 iterations: training does not change the time of a sweep. Ours are trained as always, because
 training chooses their size."""
-BOX = "box"
-"""Name of the packaged bundle among the timed calls."""
 
 
 def measured(
@@ -79,23 +78,24 @@ def measured(
         for method in [_briefly(name, effort) for name in names]:
             progress.begin(f"{method.name} is trained for its time")
             try:
-                for entry, call in _callable(method, sweeps, some, seed, cache or Path(work)):
+                for entry, whole, call in _callable(
+                    method, sweeps, some, seed, cache or Path(work)
+                ):
                     calls[str(len(entries))] = call
+                    calls |= {f"{len(entries)} {ANSWER}": whole} if whole else {}
                     entries.append(entry)
             except (FormatError, BundleError) as e:
                 left_out[method.name] = str(e)
-        if bundle.load(bundle.DEFAULT).format == sweeps.format:
-            calls[BOX] = measure.load(bundle.DEFAULT)
         log(f"{len(calls)} models take turns")
         took = measure.timed(calls, some, rounds)
-    box = _quantiles(took.pop(BOX)) if BOX in took else {}
-    for entry, times in zip(entries, took.values(), strict=True):
-        entry |= _quantiles(times)
+    for number, entry in enumerate(entries):
+        entry |= _quantiles(took[str(number)])
+        if (times := took.get(f"{number} {ANSWER}")) is not None:
+            entry[ANSWER] = _quantiles(times)["ms_p50"]
     return {
         "set": sweeps.source,
         "format": str(sweeps.format),
         "processor": processor(),
-        "box": box,
         "entries": entries,
         "left_out": left_out,
     } | score.provenance()
@@ -112,7 +112,7 @@ def of_panels(
             log(f"times of {kind}")
             sweeps = sweeps.without_means() if case.means_removed else sweeps
             times = measured(names, sweeps, seed, cache, log, effort)
-            shown = [{key: one[key] for key in CHARTED} for one in times["entries"]]
+            shown = [{k: v for k, v in one.items() if k in CHARTED} for one in times["entries"]]
             found[kind] = times | {"entries": shown}
     return found
 
@@ -129,24 +129,24 @@ def _briefly(name: str, effort: Effort) -> Method:
     )[0]
 
 
-def _callable(
-    method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path
-) -> list[tuple[Json, measure.Call]]:
+def _callable(method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path) -> list[Timed]:
     """The method in each precision of the box, or in its own library; MiniRocket in both. A model
     that the box refuses is timed all the same. some: raw counts [n, T, R, C] for its memory."""
     few = sweeps.take(np.arange(0, len(sweeps), EVERY))
     alone = {"method": method.name, "form": "", "precision": "float", "runs_on_box": False}
     if method.library:
         model = method.train(few, model_inputs(method.input, few), seed)
-        return [(alone | {"runtime": method.library}, lambda counts: model.logits(counts[None])[0])]
+        call: measure.Call = lambda counts: model.logits(counts[None])[0]  # noqa: E731
+        return [(alone | {"runtime": method.library}, None, call)]
     folder = precisions.kept_folder(method, sweeps, seed, cache)
     try:
         made = precisions.packed(method, sweeps, seed, folder)
     except BundleError as e:
         return list(_refused(method, sweeps, seed, str(e)))
-    found: list[tuple[Json, measure.Call]] = [
+    found: list[Timed] = [
         (
             _entry(one, some),
+            measure.load(one.whole) if one.whole else None,
             _graph(method, (one.folder / measure.MODEL).read_bytes(), sweeps.rate_hz),
         )
         for one in made
@@ -154,7 +154,7 @@ def _callable(
     if method.name == "minirocket":
         from palpate_studies.peers import minirocket  # only here: scikit-learn
 
-        found.append((alone | {"runtime": "aeon"}, minirocket.in_aeon(few, seed)))
+        found.append((alone | {"runtime": "aeon"}, None, minirocket.in_aeon(few, seed)))
     return found
 
 
@@ -173,9 +173,7 @@ def _entry(one: Packed, some: Array) -> Json:
     }
 
 
-def _refused(
-    method: Method, sweeps: Dataset, seed: int, why: str
-) -> Iterator[tuple[Json, measure.Call]]:
+def _refused(method: Method, sweeps: Dataset, seed: int, why: str) -> Iterator[Timed]:
     """Yield each precision of a method that the box refuses."""
     few = sweeps.take(np.arange(0, len(sweeps), EVERY))
     model = method.train(few, model_inputs(method.input, few), seed)
@@ -186,7 +184,7 @@ def _refused(
         data = graph.SerializeToString()
         more = {"runtime": "onnx", "runs_on_box": False, "refused": why}
         entry = about | more | counts | {"file_kb": len(data) / 1000}
-        yield entry, _graph(method, data, sweeps.rate_hz)
+        yield entry, None, _graph(method, data, sweeps.rate_hz)
 
 
 def _graph(method: Method, graph: bytes, rate_hz: float) -> measure.Call:

@@ -13,12 +13,13 @@ from palpate_studies import cost
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import fingerprint
-from palpate_train.export import contents, pack
+from palpate_train.export import box_answers, contents, pack
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import Method
+from palpate_train.models.recipe.fitted import FittedModel
 
-INDEX = "dots.json"
+INDEX, WHOLE = "dots.json", "whole"
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class Packed:
     """A bundle in `folder`.
 
     form: "" for the method itself, else the name of another of its precisions. precision, weights,
-    macs: as palpate_studies.cost counts them.
+    macs: as palpate_studies.cost counts them. whole: the bundle as it ships, with all its rules;
+    None for another precision and for a peer, which have none.
     """
 
     method: str
@@ -35,6 +37,7 @@ class Packed:
     folder: Path
     weights: int
     macs: int
+    whole: Path | None = None
 
 
 def kept_folder(method: Method, train: Dataset, seed: int, cache: Path) -> Path:
@@ -61,8 +64,14 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
             entries = list(_packed_forms(method, sweeps, seed, work))
             (work / INDEX).write_text(json.dumps(entries))
     entries = json.loads((folder / INDEX).read_text())
+    whole = folder / WHOLE
     return [
-        Packed(**entry | {"method": method.name, "folder": folder / entry["folder"]})
+        Packed(
+            method.name,
+            folder=folder / entry.pop("folder"),
+            whole=whole if whole.exists() and not entry["form"] else None,
+            **entry,
+        )
         for entry in entries
     ]
 
@@ -70,8 +79,10 @@ def packed(method: Method, sweeps: Dataset, seed: int, folder: Path) -> list[Pac
 def _packed_forms(
     method: Method, sweeps: Dataset, seed: int, work: Path
 ) -> Iterator[dict[str, Any]]:
-    """Each precision packed in a folder of its own."""
+    """Each precision packed in a folder of its own, and a model of ours as it ships."""
     model, made = MethodFit.of(method, sweeps, seed)
+    if isinstance(model, FittedModel):
+        box_answers.pack(model.fit, work / WHOLE)
     content = contents.content_of(made)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
