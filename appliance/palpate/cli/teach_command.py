@@ -17,6 +17,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.log import log
+from palpate.core.names import composed
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.learn import install, materials
 from palpate.learn.process import News
@@ -140,11 +141,16 @@ def _sweeps(settings: Config) -> Iterator[SweepFolder]:
 
 
 def _forget(settings: Config, material: str) -> int:
-    """Teach the sweeps of a material so far no longer."""
-    Labels(material=material)
+    """Teach the sweeps of a material, by its label or its name, so far no longer."""
     with _sweeps(settings) as folder:
-        own = [n for n, about in folder.sidecars() if about.get("material") == material]
-        folder.forget(material, own)
+        name, held = composed(material.strip()), [*folder.sidecars()]
+        called = [one for _, one in held if name in (one.get("material"), one.get("display"))]
+        material = Labels(str(called[0].get("material")) if called else name).material
+        if not called and name not in assembly.running(settings).bundle.enrolled:
+            raise ConfigError(
+                f"there is no material {name!r} to forget; name one that was recorded"
+            )
+        folder.forget(material, [n for n, one in held if one.get("material") == material])
     print(f"{material}: its sweeps so far are no longer taught; they stay in {folder.folder}")
     return 0
 

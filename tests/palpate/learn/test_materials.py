@@ -37,6 +37,7 @@ from palpate.learn.program import (
 from palpate.learn.session import MOST_NAMED, TeachingSession
 from palpate.runtime import assembly
 from palpate.sim import skin
+from palpate.sweeps import sweep_folder
 from palpate_train.data.sets import Dataset
 from tests.campaigns import junk
 from tests.factories import deliveries, lessons
@@ -152,6 +153,19 @@ def test_a_material_keeps_its_name_for_people(box, capsys):
     typed = TeachingProgram(box.settings, devices, skin.FORMAT, TaughtLesson()).names
     assert [typed.label(name) for name in ("木", "felt", "石")] == ["cork", "felt", "material"]
     assert {*box.running.bundle.manifest.labels} <= {*typed.displays, *typed.plain}
+
+
+@pytest.mark.parametrize(
+    ("name", "code"), [("cork ", 0), ("木", 0), ("corc", 78), ("石", 78), ("cork,", 78)]
+)
+def test_a_material_is_forgotten_by_its_label_or_its_name(box, capsys, name, code):
+    """A slip forgets nothing, and is said."""
+    for path in (box.store / "sweeps").glob("*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"display": "木"}))
+    assert main(["teach", *box.words, "--forget", name]) == code
+    assert (name.strip(" ,") in capsys.readouterr().err) == bool(code)
+    held = {"cork": [1, 2, 3, 4, 5, 6]}
+    assert sweep_folder.forgotten_in(box.store / "sweeps") == ({} if code else held)
 
 
 def test_a_delivery_during_use_is_not_replaced(box, capsys, monkeypatch):
