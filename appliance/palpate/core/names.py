@@ -13,7 +13,7 @@ LABEL = re.compile(rf"[A-Za-z0-9][A-Za-z0-9 _.-]{{0,{MOST_LETTERS - 1}}}")
 """Pattern of a label: short, without comma, star or dollar sign, as sentences need it."""
 UNSEEN = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
-    "\U0001d159\U000e0100-\U000e01ef]"
+    "\ufffc\U0001107f\U00013441\U00013442\U00016fe4\U0001d159\U000e0100-\U000e01ef]"
 )
 """Characters that str.isprintable lets pass and that show nothing: fillers, selectors, blanks."""
 SPELT_OUT = str.maketrans(

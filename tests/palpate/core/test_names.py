@@ -41,6 +41,7 @@ def test_each_name_has_a_label_that_can_be_sent(name, label):
         ("a\nb", False),
         ("a\u202eb", False),
         *((f"a{unseen}", False) for unseen in "\u3164\u2800\u115f\ufe0f\u034f\U000e0101"),
+        *((f"a{unseen}", False) for unseen in "\ufffc\U0001107f\U00016fe4\U00013441"),
         (7, False),
     ],
 )
