@@ -8,7 +8,6 @@ and `read_table`, JSON objects with `typed`.
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -36,9 +35,10 @@ class Within:
         return f"from {self.least} to {self.most}" if self.most < MOST else f"from {self.least} on"
 
 
-LEAST, MOST = math.ulp(0.0), sys.float_info.max
+LEAST, MOST = 2.0**-126, (2 - 2**-23) * 2.0**127
+"""The range of float32, in which a box computes."""
 Positive = Annotated[float, Within(LEAST, MOST)]
-"""A finite number above 0."""
+"""A number above 0."""
 
 
 def fixed(value: _Kind) -> _Kind:
@@ -190,8 +190,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value) is tuple and all(_fits(v, get_args(hint)[0]) for v in value)
     if get_origin(hint) is dict:
         return type(value) is dict and all(_fits(v, get_args(hint)[1]) for v in value.values())
-    if hint in (int, float):  # at most 64 bits, finite
-        return type(value) in (int, hint) and abs(value) <= (
-            sys.float_info.max if type(value) is float else sys.maxsize
-        )
+    if hint in (int, float):
+        most = MOST if type(value) is float else sys.maxsize
+        return type(value) in (int, hint) and abs(value) <= most
     return hint is Any or (type(value) is hint and (hint is not str or value.isprintable()))
