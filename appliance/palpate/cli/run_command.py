@@ -47,6 +47,8 @@ def run(args: argparse.Namespace) -> int:
         if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
             from palpate.cli import teach_command  # here: a box in service does without it
 
+            if release:
+                release.serves()
             return teach_command.until_taught(args, settings)
         if release and choice and choice.trial:
             release.stopping()  # it must be clear which of both was the cause of a failure

@@ -22,7 +22,7 @@ from palpate.core.observer import Observer
 from palpate.core.status import Status
 from palpate.deployment import releases
 from palpate.deployment.state import Goal
-from palpate.deployment.trial import Trial
+from palpate.deployment.trial import ERRORS, Trial
 
 if TYPE_CHECKING:
     from palpate.core.health import Health
@@ -84,6 +84,12 @@ class ReleaseTrial(Trial):
         log.error(f"{self._title} goes back: {why}")
         self._store.failed(why)
         self.over = os.path.exists(self.proven)
+
+    def serves(self) -> None:
+        """This start has nothing to answer, as on a box that is being taught, but serves: the mains
+        switch may end it."""
+        self._worked = True
+        self._log.attempt(self._note(True), ERRORS)
 
     def answered(self, verdict: Verdict) -> None:
         """As for a bundle."""

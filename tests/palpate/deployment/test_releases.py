@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from palpate.bundle.bundle import DEFAULT
+from palpate.cli import run_command, teach_command
 from palpate.cli.main import main
 from palpate.core.errors import ConfigError
 from palpate.core.types import Status, Verdict
@@ -102,6 +103,19 @@ def day(box: TrialBox) -> None:
     box.boot.write_text(f"after {os.urandom(4).hex()}\n")
 
 
+def teach(box: TrialBox) -> None:
+    """A start of a box that is taught first, killed."""
+    trial = box.start()
+    if trial:
+        trial.serves()
+
+
+def lesson(box: TrialBox) -> None:
+    """A day of teaching that the mains switch ends."""
+    teach(box)
+    box.boot.write_text(f"after {os.urandom(4).hex()}\n")
+
+
 def work(box: TrialBox) -> None:
     """A start that answers a sweep and then crashes."""
     trial = box.start()
@@ -142,6 +156,8 @@ def failing(box: TrialBox) -> None:
         ([unplugged] * 30, NEW),
         ([day] * 30, NEW),
         ([*[cut] * 9, day] * 3, NEW),
+        ([lesson] * 30, NEW),
+        ([teach] * 3, OLD),
         ([cut] * 10, OLD),
         ([killed] * 2, NEW),
         ([killed] * 3, OLD),
@@ -351,6 +367,25 @@ def test_sweeps_on_trial_are_written_once(
     runs = 2 if black_box else 1
     assert len([*box.opt.parent.rglob("*.npy")]) == len([*kept.glob("*.npy")]) == 3 * runs
     assert asked[0][-3:] == [str(kept), str(DEFAULT), str(3 * (runs - 1))]
+
+
+def test_a_box_that_is_taught_first_may_be_switched_off(
+    box: TrialBox, monkeypatch: pytest.MonkeyPatch
+):
+    """Its service has nothing to answer until it is taught."""
+    monkeypatch.setattr(run_command, "untaught", lambda *of: True)
+    seen: list[bool] = []
+
+    def until_taught(*of: object) -> int:
+        trial = box.releases.trial
+        seen.append(bool(trial and releases.read_report(box.report, trial).worked))
+        return 0
+
+    monkeypatch.setattr(teach_command, "until_taught", until_taught)
+    trial = box.start()
+    monkeypatch.setattr(release_trial, "observed", lambda: trial)
+    assert main([*RUN, f"store.folder={box.opt.parent / 'store'}"]) == 0
+    assert seen == [True]
 
 
 def test_a_comparison_that_hangs_is_ended(box: TrialBox):
