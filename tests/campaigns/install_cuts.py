@@ -49,7 +49,7 @@ TAUGHT = {"wood": 4, "metal": 4, "foam": 4}
 """Sweeps of each material that the box is taught from."""
 APART = "/var/lib/palpate/simulated"
 """A folder of simulated sweeps, which must not teach a box."""
-PER_RUN, AT_ONCE = 20, 4
+PER_RUN, AT_ONCE = 40, 8
 """Cuts of one run of a command, and hosts that boot at a time: most of the time they wait for the
 skin to be touched."""
 ANSWER = re.compile(r"(sweep \d+: (?!no answer, gap)[^(]*).*")
