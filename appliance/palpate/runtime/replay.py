@@ -24,6 +24,7 @@ from palpate.core import config
 from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
+from palpate.core.text import printable, say
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.deployment.release_trial import OTHERWISE
 from palpate.inference.classifier import RULE, Classifier
@@ -204,7 +205,8 @@ def _change(name: str, was: object, now: object) -> str:
 def _print(path: Path, found: ReplayResult, out: Callable[[str], object]) -> str:
     if found.verdict:
         out(result(found.verdict, "replay").decode("ascii"))
-    out(f"{path.name}: {found.outcome}{found.detail and f' ({found.detail})'}\n")
+    said = f"{path.name}: {found.outcome}{found.detail and f' ({found.detail})'}"
+    out(f"{printable(said)}\n")
     return found.outcome
 
 
@@ -266,7 +268,7 @@ def main(argv: Sequence[str]) -> int:
     bundle = bundle_files.load(Path(of))
     count, found = changed(Path(folder), config.load(None), bundle, int(run))
     if found:
-        print(f"{len(found)} of {count} sweeps are answered otherwise ({found[-1]})")
+        say(f"{len(found)} of {count} sweeps are answered otherwise ({found[-1]})")
     return OTHERWISE if found else 0
 
 

@@ -399,3 +399,12 @@ def test_another_skin_and_an_empty_folder(tmp_path, default_bundle):
         played(tmp_path, default_bundle)
     with pytest.raises(FormatError, match=r"2x2.*4x4"):
         played(kept_toy(tmp_path), default_bundle)
+
+
+def test_a_name_of_a_file_forges_no_line(tmp_path, default_bundle):
+    """Escape sequences and line breaks are shown as one printable line."""
+    (tmp_path / "sweep-1\x1b[2J\r\n2 sweeps: 2 the same.npy").touch()
+    lines: list[str] = []
+    replay(tmp_path, HERE, default_bundle, lines.append)
+    assert [line for line in "".join(lines).splitlines() if not line.isprintable()] == []
+    assert len(lines) == 2
