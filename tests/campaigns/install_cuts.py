@@ -55,7 +55,7 @@ skin to be touched."""
 ANSWER = re.compile(r"(sweep \d+: (?!no answer, gap)[^(]*).*")
 """A line of the journal, with the answer but without the time that it took. A busy machine loses
 frames of the simulated skin; such a sweep says nothing."""
-AND = "; "
+ANSWERED = re.compile(r"sweep (\d+): ([^;]+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +223,7 @@ def _answers(machine: nspawn.Machine, count: int) -> tuple[str, float]:
         found = [(line, it) for line in lines if (it := ANSWER.fullmatch(str(line["MESSAGE"])))]
         if len(found) >= count:
             texts = [it[1].strip() for _, it in found[:count]]
-            return AND.join(texts), int(found[0][0]["__MONOTONIC_TIMESTAMP"]) / 1e6
+            return "; ".join(texts), int(found[0][0]["__MONOTONIC_TIMESTAMP"]) / 1e6
         time.sleep(0.2)
     raise AssertionError("no sweep is answered")
 
@@ -231,11 +231,11 @@ def _answers(machine: nspawn.Machine, count: int) -> tuple[str, float]:
 def cuts(host: CutHost, command: str, times: int, seed: int) -> Iterator[InstallCut]:
     """Cuts of a command: at random instants, and at the end of each run."""
     rng = random.Random(f"{command} {seed}")
-    known: dict[bool, list[str]] = {}
+    known: dict[bool, dict[str, str]] = {}
     for found in host.cut(command, 0.0, [0.0]):
         of_s, one = found.at_s, host.again(command, found.at_s, found, 3)
         assert (one.new, one.wrong) == (found.ended, ""), one
-        known[one.new] = one.answer.split(AND)
+        known[one.new] = dict(ANSWERED.findall(one.answer))
     with ThreadPoolExecutor(AT_ONCE) as pool:
         for number in range(0, times, PER_RUN):
             shares = [rng.random() for _ in range(min(PER_RUN, times - number) - 1)]
@@ -244,7 +244,9 @@ def cuts(host: CutHost, command: str, times: int, seed: int) -> Iterator[Install
                 begun.append(pool.submit(host.again, command, of_s, found))
             of_s = found.at_s
             for one in (found.result() for found in begun):
-                other = "" if one.answer in known[one.new] else f"answers of {known[one.new]}"
+                ((number, said),) = ANSWERED.findall(one.answer)
+                right = {**known[not one.new], **known[one.new]}.get(number)
+                other = "" if said == right else f"{right} without a cut"
                 yield replace(one, wrong="; ".join(filter(None, (one.wrong, other))))
 
 
