@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from palpate.answer.contact import ContactPositions
+from palpate.answer.correlation import Correlations
 from palpate.answer.displacement import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
@@ -25,8 +26,9 @@ class Rules:
     judge and are left out on trial.
 
     disturbances: noise, load, speed, lost frames and hum. displacement: contacts elsewhere. speeds:
-    range in training. sliding: limits between slides and rests. bridging: broken taxels that the
-    model tolerates. known: unknown materials. contact: positions in training.
+    range in training. sliding: limits between slides and rests. correlations: between slides
+    and noise. bridging: broken taxels that the model tolerates. known: unknown materials. contact:
+    positions in training.
     """
 
     early: Early | None = None
@@ -34,6 +36,7 @@ class Rules:
     displacement: DisplacementRule | None = None
     speeds: SpeedRange | None = None
     sliding: SlideLimits | None = None
+    correlations: Correlations | None = None
     bridging: Bridging | None = None
     known: Known | None = None
     contact: ContactPositions | None = None

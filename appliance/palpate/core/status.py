@@ -56,6 +56,7 @@ class Reason(StrEnum):
     UNLOADED = "unloaded"
     TOO_FAR = "too-far"
     NO_PATTERN = "no-pattern"
+    NOISE = "noise"
     RESTS = "rests"
     UNTRIED = "untried"
     UNLIKE_ALL = "unlike-all"
@@ -75,6 +76,7 @@ DETAILS: Mapping[Reason, str] = MappingProxyType(
         Reason.UNLOADED: "strongest taxel {counts:.1f} raw counts",
         Reason.TOO_FAR: "named up to {farthest_mm:.1f} mm",
         Reason.NO_PATTERN: "no pattern passes from taxel to taxel, as with a finger that rests",
+        Reason.NOISE: "the counts move like noise, not as over a slide",
         Reason.RESTS: "hardly any vibration in part {parts} of {of}, less than {label} gives",
         Reason.UNTRIED: "{what}",
         Reason.UNLIKE_ALL: _UNLIKE,

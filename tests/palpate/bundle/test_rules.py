@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from palpate.answer.correlation import Correlations
 from palpate.answer.disturbance import Allowance, Disturbances
 from palpate.answer.early import Early
 from palpate.answer.load_modes import LoadModes
@@ -33,6 +34,7 @@ WRITTEN: list[dict[str, Any]] = [
     {"bridging": BRIDGING},
     {"bridging": replace(BRIDGING, loads=LOADS)},
     {"sliding": SlideLimits((-5.0, -1.0), 0.3)},
+    {"correlations": Correlations(0.02, -1.0)},
     {"early": EARLY},
     {"unloaded": tuple(map(float, range(16)))},
 ]
@@ -72,6 +74,8 @@ OUT: list[tuple[Any, str, str, tuple[Any, ...]]] = [
     (EARLY, "limits", r"early\.limits", ((4.0,), (4.0, 0.0, 4.0), (4.0, "4", 4.0))),
     (toy_bundle.DISPLACEMENT, "farthest_mm", "farthest_mm", (0,)),
     (SlideLimits(()), "least", r"sliding\.least", ((inf,), (nan, -1.0), ("-5",))),
+    (Correlations(), "frames", r"correlations\.frames", (-1.1, nan, "0")),
+    (Correlations(), "taxels", r"correlations\.taxels", (1.1, inf)),
     (SlideLimits(()), "pattern", r"sliding\.pattern", (0.0, -1.0, inf, nan)),
 ]
 """A rule, a field of it, what its refusal says, and the values that are refused."""

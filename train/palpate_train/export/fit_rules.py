@@ -18,6 +18,7 @@ from palpate_train.answer import (
     altered_sweeps,
     calibrate,
     embedding,
+    fit_correlation,
     fit_early,
     fit_slide,
     fit_taxels,
@@ -160,6 +161,7 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
         unloaded=contacts.limit.known_tare(),
         speeds=speeds,
         displacement=content.displacement,
+        correlations=fit_correlation.limits(train, content.held_out),
         made=manifest.made
         | {f"{part}_unknown_because": why for part, why in unknown.items() if why},
     )
