@@ -70,7 +70,7 @@ def test_a_cross_fit_is_corrected_for_what_it_lacks(parts: int):
     np.testing.assert_allclose(known[0] - known[1], 1.5 - 1.5 / (parts - 1), atol=1e-9)
 
 
-@pytest.mark.parametrize(("n", "least", "most"), [(160, 0.75, 1.0), (400, 0.45, 0.7)])
+@pytest.mark.parametrize(("n", "least", "most"), [(160, 0.65, 0.8), (400, 0.45, 0.6)])
 def test_known_sweeps_are_kept_at_any_cost(n: int, least: float, most: float):
     """Half at a million times the cost, more of few sweeps; nearly all where no material was left
     out."""
@@ -93,7 +93,7 @@ def test_neither_a_cross_fit_nor_junk_closes_the_box():
     assert (far.corrected()[0] >= np.log(far.learned)).all()
     junk = {"mixed": np.full(60, np.exp(-4.0))}
     found = limits({"force": left_out(160)}, 1e6, junk)
-    assert found.figures["balanced"]["answered"][0] >= 0.75
+    assert 0.65 <= found.figures["balanced"]["answered"][0] <= 0.8
 
 
 @pytest.mark.parametrize("cost", [0.0, -1.0, np.nan, np.inf])
