@@ -97,3 +97,22 @@ def test_tests_run_on_the_numpy_of_the_box():
     """Whatever else the desktop installs."""
     lock = (ROOT / "appliance" / "requirements.lock").read_text()
     assert re.findall(r"(?m)^numpy==(\S+)", lock) == [metadata.version("numpy")]
+
+
+def test_the_least_onnxruntime_is_what_was_tried():
+    """The page of processors says from which version on int8 sums were exact; no older one is
+    admitted."""
+    page = " ".join((ROOT / "docs" / "reference" / "processors.md").read_text().split())
+    wrong, exact = re.findall(
+        r"onnxruntime ([\d.]+ to [\d.]+) gives .*?; ([\d.]+) and later", page
+    )[0]
+    (least,) = [
+        asked.specifier
+        for file in ("pyproject.toml", "train/pyproject.toml")
+        for asked in map(
+            Requirement, tomllib.loads((ROOT / file).read_text())["project"]["dependencies"]
+        )
+        if asked.name == "onnxruntime"
+    ]
+    assert least.contains(exact)
+    assert not any(map(least.contains, [*wrong.split(" to "), "1.26.99"]))
