@@ -111,6 +111,22 @@ def test_slow_waves_join_unless_they_harm(slow: tuple[int, ...], joins: bool):
     assert not put_back.beside(put_back.usual())
 
 
+@pytest.mark.parametrize(("n", "few"), [(60, True), (600, False)])
+def test_a_few_sweeps_take_relations_and_ask_more_of_slow_waves(n: int, few: bool):
+    """Some of 60 get a wrong label: relations join them without showing a gain. Slow waves of noise
+    raise the loss and join 600 alone."""
+    given, parts = known(n)
+    rng, x = np.random.default_rng(1), given.features.copy()
+    x[:, GOOD] += 0.8 * rng.standard_normal((n, 2))
+    at = HeldOutScores([replace(given, features=x, of_copies=lambda: x)] * 3, parts, 3)
+    offered = partial(candidates, [[0, 1]], GOOD, GOOD)
+    related = choice.choose(at, offered(relations=[[2]]), print).plan
+    assert (2 in related.columns()) is few
+    slow = choice.choose(at, offered(slow=NOISE), print).plan
+    assert (NOISE[0] in slow.columns()) is not few
+    assert not offered(relations=[[2]], copies=True).unshown(offered().usual())
+
+
 def test_what_is_better_in_every_group_is_chosen():
     """Bands that name most; not the feature that is best within a group alone."""
     given, parts = known(600)

@@ -29,6 +29,10 @@ Array = NDArray[Any]
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on copies and stages improve too little for their share of
 a fit's time, and stages for that of the bundle."""
+MANY = 100
+"""Number of held-out sweeps from which on they show what makes a sum worse. Fewer may show nothing
+of that: there relations, which a dozen sweeps ask for too seldom, join, and slow waves have to
+gain."""
 Columns = tuple[int, ...]
 
 
@@ -297,8 +301,13 @@ class Candidates:
         filters = [head(of.magnitudes, of.shares, of.bands)]
         if len(of.levels):
             filters.append(head(of.magnitudes, of.levels, of.bands))
-        views = dict.fromkeys((head(of.relations[: relations.SHORT]), head(of.relations)))
-        return {"relations beside filters": (*filters, *views)}
+        return {"relations beside filters": (*filters, *self._few_and_all(best))}
+
+    def _few_and_all(self, best: Heads) -> Heads:
+        """A discriminant of the relations at few scales, and one of all."""
+        of, copies = self.columns, best[0].copies
+        views = of.relations[: relations.SHORT], of.relations
+        return tuple(dict.fromkeys(HeadPart(tuple(v.ravel().tolist()), copies) for v in views))
 
     def steady(self, best: Heads) -> dict[str, Heads]:
         """Shares, distribution, and one and few scales of the relations, a discriminant each: they
@@ -336,6 +345,15 @@ class Candidates:
             return {}
         alone = HeadPart(tuple(loads.tolist()), best[0].copies)
         return {"with loads beside": (*best, alone), "with loads in each": _with(best, loads)}
+
+    def unshown(self, best: Heads) -> dict[str, Heads]:
+        """Joins the best candidate of a few sweeps unless it makes it worse: the relations, if it
+        has none."""
+        of = self.columns
+        seen = np.concatenate([part.columns for part in best])
+        if self.copies or not of.relations.size or np.isin(of.relations, seen).any():
+            return {}
+        return {"with relations beside": (*best, *self._few_and_all(best))}
 
     def beside(self, best: Heads) -> dict[str, Heads]:
         """Joins the best candidate unless it makes it worse: a discriminant of the slow waves. On a
@@ -388,9 +406,13 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
         rivals += [score(*named) for named in heads.items()]
         best = min(rivals, key=scores.loss, default=chosen)
         chosen, rivals = best if accepts(scores.paired(best, chosen)) else chosen, []
-    for named in candidates.beside(chosen.plan.parts).items():
+    few = scores.accuracy(chosen) < ENOUGH and scores.own.sum() < MANY
+    for named in candidates.unshown(chosen.plan.parts).items() if few else ():
         joined = score(*named)
         chosen = chosen if scores.paired(joined, chosen).worse else joined
+    for named in candidates.beside(chosen.plan.parts).items():
+        found = scores.paired(joined := score(*named), chosen)
+        chosen = joined if (found.gains if few else not found.worse) else chosen
     return chosen
 
 
