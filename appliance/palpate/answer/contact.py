@@ -96,7 +96,8 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
 def centre_of(mean: NDArray[np.float64], tare: NDArray[np.float64], contact: float) -> Point | None:
     """As `centre`, from the mean counts [R, C] along the normal. tare: [R, C]."""
     load = mean - tare
-    if not contact <= load.min() <= load.max() < np.inf:
+    least, most = np.minimum.reduce(load, axis=None), np.maximum.reduce(load, axis=None)
+    if not contact <= least <= most < np.inf:
         load = fill_dead_taxels(np.where((load >= contact) & (load < np.inf), load, 0))
     total, row, column = (_moments(*load.shape) @ load.ravel()).tolist()
     return (row / total, column / total) if total > 0 else None

@@ -55,8 +55,8 @@ def noise(taxels: Counts) -> float:
     for _ in range(ORDER):
         steps = steps[values:] - steps[:-values]
     squares = (steps * steps).reshape(-1, values)
-    powers = np.sort(ones(len(squares)).dot(squares))  # those that are not finite are last
-    middle = float(powers[(values - 1) // 2]) + float(powers[values // 2])
+    powers = np.sort(ones(len(squares)).dot(squares)).tolist()  # those not finite are last
+    middle = powers[(values - 1) // 2] + powers[values // 2]
     power = middle / 2 / len(squares) / math.comb(2 * ORDER, ORDER)
     return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
 
@@ -64,7 +64,7 @@ def noise(taxels: Counts) -> float:
 def load(mean: Array, tare: Array) -> float:
     """Natural logarithm of the load of all taxels. mean, tare: counts [R, C] or [R, C, A] of the
     window and of the unloaded skin."""
-    total = float(np.abs(normal(mean, 0) - normal(tare, 0)).sum())
+    total = float(np.add.reduce(np.abs(normal(mean, 0) - normal(tare, 0)), axis=None))
     return math.log(max(total, TINY)) if math.isfinite(total) else math.nan
 
 

@@ -46,13 +46,15 @@ class HumLines:
     """The lines that a window of some length can show.
 
     hz, mains, order: [L], frequency, that of the mains, and the multiple. waves: at each line and
-    at frequencies around it, F = L * (1 + 2 * len(ASIDE)).
+    at frequencies around it, F = L * (1 + 2 * len(ASIDE)). powers: float32 [2 * L, 2 * F], gives
+    the power at each line, and then its mean beside each line, of squares of `waves`.
     """
 
     hz: Array
     mains: Array
     order: Array
     waves: Waves
+    powers: NDArray[np.float32]
 
     @classmethod
     def of(cls, frames: int, rate_hz: float, multiples: int) -> HumLines:
@@ -69,7 +71,10 @@ class HumLines:
         hz, mains, order = np.array(lines).reshape(-1, 3).T
         aside = np.array([0, *ASIDE, *(-step for step in ASIDE)]) / seconds
         every = (hz[:, None] + aside).ravel()
-        return cls(hz, mains, order, Waves(every, frames, rate_hz))
+        at, beside = aside == 0, (aside != 0) / (len(aside) - 1)
+        powers = [np.kron(np.eye(len(hz)), one.repeat(2)) for one in (at, beside)]
+        waves = Waves(every, frames, rate_hz)
+        return cls(hz, mains, order, waves, np.concatenate(powers).astype(np.float32))
 
 
 class HumFilter:
@@ -95,7 +100,7 @@ class HumFilter:
         window = Window.of(taxels)
         taxels, searched = window.taxels, self._of(len(window))
         found = self._ratios(searched, window, least)
-        if not found.max(initial=0.0) >= least:
+        if not found.any() or found.max() < least:
             return taxels, 0.0
         series = taxels.reshape(len(taxels), -1).astype(np.float64)
         series -= series.mean(axis=0)
@@ -138,15 +143,18 @@ class HumFilter:
         found = np.zeros(len(lines.hz))
         if not len(found):
             return found
-        parts = lines.waves(window.counts).reshape(len(found), 1 + 2 * len(ASIDE), -1)
-        power = np.square(np.abs(parts))
-        beside = np.add.reduce(power[:, 1:], axis=1) / (2 * len(ASIDE))
+        parts = lines.waves(window.counts)
+        squares = np.square(parts).reshape(lines.powers.shape[1], -1)
+        power, beside = (lines.powers @ squares).reshape(2, len(found), -1)
         # the ratio of two sums is at most the largest ratio of their parts
-        possible = power[:, 0] >= least**2 * beside
-        for i in np.flatnonzero(possible.any(axis=1)) if possible.any() else ():
+        possible = power >= least**2 * beside
+        if not np.logical_or.reduce(possible, axis=None):
+            return found
+        parts = parts.reshape(len(found), -1, *parts.shape[1:])[:, 0]
+        for i in np.flatnonzero(possible.any(axis=1)):
             near = np.sqrt(beside[i])
             quiet = np.argsort(near)[: max(1, len(near) // ONE_IN)]
-            at = parts[i, 0, quiet]
+            at = parts[i, 0, quiet] + 1j * parts[i, 1, quiet]
             size = np.abs(at).sum()
             ratio = size / max(near[quiet].sum(), TINY)
             if np.abs(at.sum()) >= IN_PHASE * size > 0 and np.isfinite(ratio):
@@ -157,7 +165,8 @@ class HumFilter:
         """The frequency within `off_hz` of `hz` at which all taxels together, float32 [T, 1], have
         most power: the highest of some frequencies, and the vertex of a parabola around it."""
         tried = hz + np.linspace(-off_hz, off_hz, STEPS)
-        found = np.abs(Waves(tried, len(common), self._rate_hz)(common)[:, 0])
+        real, imaginary = Waves(tried, len(common), self._rate_hz)(common)[:, :, 0].T
+        found = np.abs(real + 1j * imaginary)
         power = np.log(found + TINY, dtype=np.float64)
         top = int(power.argmax())
         if top in (0, STEPS - 1):

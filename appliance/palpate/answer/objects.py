@@ -26,8 +26,8 @@ all others."""
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
     """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
     z = np.asarray(logits, np.float64)
-    e = np.exp(z - z.max(axis=-1, keepdims=True))
-    result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
+    e = np.exp(z - np.maximum.reduce(z, axis=-1, keepdims=True))
+    result: NDArray[np.float64] = e / np.add.reduce(e, axis=-1, keepdims=True)
     return result
 
 
@@ -209,7 +209,7 @@ class Certain:
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse an uncertain answer."""
-        if context.scores.max() < self._least[context.displacement.off]:
+        if max(context.scores.tolist()) < self._least[context.displacement.off]:
             status = Status.UNDECIDED if context.final else Status.UNSURE
             return Refusal(status, context.remark)
         return None

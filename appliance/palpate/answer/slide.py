@@ -132,7 +132,7 @@ class SlideMeter:
         lag_s = np.arange(1, SEPARATIONS + 1)[:, None] / speeds
         phase = 2 * np.pi * hz * lag_s
         use = (hz <= WAVES * speeds) & (lag_s <= seconds / 2)
-        tables = np.stack([np.cos(phase) * use, np.sin(phase) * use, use])
+        tables = np.stack([np.cos(phase) * use, np.sin(phase) * use, use / 2])
         self._grid = tables.reshape(3, 1, len(speeds), -1).astype(np.float32)
 
     def __call__(self, taxels: Counts) -> Slide:
@@ -143,34 +143,32 @@ class SlideMeter:
         spectra = self._spectra(Window.of(taxels))
         if spectra is None:
             return Slide(why=f"the counts of fewer than {LEAST_TAXELS} taxels change")
-        return self._slide(self._heights(spectra))
+        return self._slide(self._heights(spectra.view(np.complex64)))
 
     def _spectra(self, window: Window) -> Array | None:
-        """Spectra complex64 [M, F] of the M taxels of the block that moves most, without the part
-        that they have in common; None if too few of them change. Silent and broken taxels are 0,
-        and none is louder than the median."""
+        """Spectra [M, 2 * F] of the M taxels of the block that moves most, real and imaginary parts
+        side by side, without the part that they have in common; None if too few of them change.
+        Silent and broken taxels are 0, and none is louder than the median."""
         counts = window.counts[: self._frames * self._each]
         if counts.shape[1] > BLOCK * BLOCK:
             counts = _busiest(counts.reshape(-1, *window.taxels.shape[1:3]), self._shape)
         # four times as fast as sum(axis=1)
         summed = np.einsum("tev->tv", counts.reshape(self._frames, self._each, -1))
         # real and imaginary parts in one row: qemu 7.2 cannot run np.maximum on every other number
-        parts = self._waves(summed).T.copy().view(np.float32)
+        parts = self._waves(summed).reshape(-1, summed.shape[1]).T.copy()
         power = np.vecdot(parts, parts)
-        if not math.isfinite(power.max()):
-            power[~np.isfinite(power)] = 0
-        silent = power == 0
-        heard = len(power) - int(np.count_nonzero(silent))
-        if heard < LEAST_TAXELS:
-            return None
-        if heard < len(power):
-            parts[silent] = 0
-        median = np.sort(power)[len(power) - heard + heard // 2]
-        parts *= 1 / np.sqrt(np.maximum(power, median))[:, None]
+        ordered = np.sort(power).tolist()  # NaN is last
+        if not 0 < ordered[0] <= ordered[-1] < math.inf:
+            silent = ~np.isfinite(power) | (power == 0)
+            parts[silent] = power[silent] = 0
+            ordered = sorted(power[~silent].tolist())
+            if len(ordered) < LEAST_TAXELS:
+                return None
+        parts *= 1 / np.sqrt(np.maximum(power, np.float32(ordered[len(ordered) // 2])))[:, None]
         common = np.add.reduce(parts)
-        shares = parts @ common / max(float(common @ common), TINY)
+        shares = parts.dot(common) / max(float(common.dot(common)), TINY)
         parts -= shares[:, None] * common
-        return parts.view(np.complex64)
+        return parts
 
     def _heights(self, spectra: Array) -> Array:
         """Heights [2, 2, V + 1] of the sums for slides towards higher and lower numbers, along rows
@@ -179,12 +177,11 @@ class SlideMeter:
         # the root of a product is the product of roots, and there are fewer roots than products
         rooted = spectra * (1 / np.sqrt(np.maximum(size, TINY)))
         first, second = rooted.take(self._pairs, 0)
-        sums = self._of_pair @ (first * second.conj()).view(np.float32)
-        sums = sums.view(np.complex64).reshape(2, -1)
+        sums = self._of_pair.dot((first * second.conj()).view(np.float32))
         first, second = size.take(self._pairs, 0)
-        spread = self._of_pair @ (first * second)
-        given = np.array([sums.real, sums.imag, spread.reshape(2, -1) / 2])
-        straight, across, variance = np.vecdot(given[:, :, None], self._grid)
+        spread = self._of_pair.dot(first * second)
+        given = np.array([sums[:, ::2], sums[:, 1::2], spread]).reshape(3, 2, 1, -1)
+        straight, across, variance = np.vecdot(given, self._grid)
         heights = np.array([straight - across, straight + across])
         heights /= np.sqrt(np.maximum(variance, TINY))
         return heights
@@ -193,8 +190,11 @@ class SlideMeter:
         """The slide at the highest peak of an axis on which the pattern has a lag, or the reason
         why it is not one."""
         speeds = len(self._taxels_s)
-        tops, still = heights[..., :speeds].max(axis=(0, 2)), heights[0, :, speeds]
-        lagging = (tops * (tops >= RATIO * still)).tolist()
+        tops = np.maximum.reduce(heights[..., :speeds], axis=(0, 2)).tolist()
+        stills = heights[0, :, speeds].tolist()
+        lagging = [
+            top if top >= RATIO * still else 0.0 for top, still in zip(tops, stills, strict=True)
+        ]
         height = max(0.0, *lagging)
         if height < LEAST_HEIGHT:
             return Slide(height=height, why=NO_PATTERN)
@@ -207,7 +207,7 @@ class SlideMeter:
             return Slide(height=height, why=why)
         before, top, after = heights[sign, at - 1 : at + 2].tolist()
         heights[sign, max(0, at - APART) : at + APART + 1] = 0
-        if height < RATIO * heights.max():
+        if height < RATIO * np.maximum.reduce(heights, axis=None):
             return Slide(height=height, why="the pattern fits several speeds")
         bend = before - 2 * top + after
         shift = (before - after) / (2 * bend) if bend else 0.0  # the vertex of a parabola

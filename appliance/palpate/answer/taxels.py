@@ -168,10 +168,9 @@ class Comparison:
 def surely_sound(measured: Window, bridging: Bridging) -> bool:
     """Whether all values change, and none is far noisier than the quietest: then `find` finds none,
     which takes longer."""
-    quiet, loud = float(measured.noise.min()), float(measured.noise.max())
-    return (
-        measured.readable and quiet > 0 and loud <= bridging.noise * max(quiet, bridging.quietest)
-    )
+    quiet, loud = measured.quietest, np.maximum.reduce(measured.noise)
+    sound = quiet > 0 and loud <= bridging.noise * max(quiet, bridging.quietest)
+    return measured.readable and bool(sound)
 
 
 def find(

@@ -68,7 +68,8 @@ def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
     offset = normal(window.series[0].reshape(tare.shape) - tare, 0)
     means, flat = ones(each) @ series / each, series.reshape(parts, -1)
     variance = (np.vecdot(flat, flat) / each - np.vecdot(means, means)) / offset.size
-    load = np.abs(means.dot(ones(offset.size)) + offset.sum()) / offset.size
+    total = np.add.reduce(offset, axis=None)
+    load = np.abs(means.dot(ones(offset.size)) + total) / offset.size
     result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
     return result
 

@@ -48,7 +48,7 @@ class WindowLimits:
     dead_taxels: Annotated[int, Within(0, 255 * 255)] = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Finding:
     """Result of the check of a window: status ok, or another status with a remark.
 
@@ -103,16 +103,17 @@ def inspect(
     load = window.mean.reshape(shape) - tare.reshape(shape)
     load = np.abs(load) if either_way else load
     # possible with float32 counts; the network's output would then be meaningless
-    if not (window.readable and math.isfinite(load.sum())):
+    if not (window.readable and math.isfinite(np.add.reduce(load, axis=None))):
         unreadable = window.unreadable.reshape(shape) | ~np.isfinite(load)
         return Finding(Status.DEAD_TAXEL, _taxels(unreadable))
-    loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
-    if not loaded.any():
-        strongest = float(load[..., -1].max())
+    contact = -np.inf if limits.contact is None else limits.contact
+    strongest = float(np.maximum.reduce(load[..., -1], axis=None))
+    if strongest < contact:
         return Finding(Status.NO_CONTACT, Remark(Reason.UNLOADED, {"counts": strongest}))
     full = _at_full_scale(window, limits.full_scale, shape)
-    if full is None and window.noise.min() > 0:
+    if full is None and window.quietest > 0:
         return Finding(Status.OK, mean=window.mean.reshape(tare.shape))
+    loaded = load[..., -1:] >= contact  # [R, C, 1]
     full, still = np.zeros(shape) if full is None else full, window.still.reshape(shape)
     stuck = still & loaded & (full < 1)
     if (count := int(stuck.any(axis=2).sum())) > limits.dead_taxels:
@@ -150,7 +151,8 @@ def _at_full_scale(
     """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative, too.
     None if there are none, as mostly: counting takes longer than all the rest."""
     series = window.series
-    if series.max() < full_scale and (shape[2] == 1 or series.min() > -full_scale):
+    top = np.maximum.reduce(series, axis=None)
+    if top < full_scale and (shape[2] == 1 or series.min() > -full_scale):
         return None
     full: NDArray[np.float64] = (series >= full_scale).mean(axis=0).reshape(shape)
     full[..., :-1] += (series <= -full_scale).mean(axis=0).reshape(shape)[..., :-1]
