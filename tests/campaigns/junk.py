@@ -21,8 +21,7 @@ from palpate.bundle import bundle
 from palpate.core import storage
 from palpate.core.provenance import commit
 from palpate.core.types import Frames, Status, Sweep, Verdict
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from palpate_train.metrics.bundle_score import first_answer

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from palpate.bundle import bundle
 from palpate.core.errors import ApplianceError
 from palpate.core.types import Frames, Status, Sweep
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from palpate_train.answer.altered_sweeps import altered_copies

@@ -3,7 +3,7 @@
 import numpy as np
 
 from palpate_train.answer.calibrate import CalibrationInputs
-from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_contact import AugmentedCopies
 
 
 def plain_inputs(

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer.contact import ContactPositions
-from palpate.answer.displacement import DisplacementRule
+from palpate.answer.contact import ContactPositions, DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
 from palpate.answer.pipeline import Context, Stage

@@ -19,11 +19,12 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context, Displacement
+from palpate.answer.pipeline import Context, Displacement, Refusal, Stage, StageInputs
 from palpate.answer.window import Window
 from palpate.core.errors import BundleError
-from palpate.core.schema import LEAST, Within, check
-from palpate.core.types import normal
+from palpate.core.schema import LEAST, Positive, Within, check
+from palpate.core.status import Reason, Remark
+from palpate.core.types import Status, normal
 
 LEAST_PART = 0.25
 """A direction with a smaller share of the distance is left out: it changes the distance by less
@@ -171,3 +172,42 @@ class LocateContact:
         context.displacement = displacement(
             context.mean, context.tare, self._contact, self._positions
         )
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementRule:
+    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
+    number out of range.
+
+    limit: as Known.balanced, for the distances of displaced sweeps. temperature: divisor of logits
+    that are calibrated for sweeps without displacement. unsure: least probability for status ok;
+    above 1 a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep
+    gets no label, because no training copy is displaced as far; None if unknown.
+    """
+
+    limit: Positive
+    temperature: Positive
+    unsure: Positive
+    farthest_mm: Positive | None = None
+
+    def __post_init__(self) -> None:
+        check(self, "displacement")
+
+    def judges(self, given: StageInputs) -> list[Stage]:
+        """Whether the contact is within reach."""
+        return [] if self.farthest_mm is None else [WithinReach(self.farthest_mm)]
+
+
+class WithinReach:
+    """Refuses a contact that is displaced further than any training copy, `farthest_mm`."""
+
+    def __init__(self, farthest_mm: float) -> None:
+        self._farthest_mm = farthest_mm
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a sweep that is too far off."""
+        if context.displacement.mm > self._farthest_mm:
+            return Refusal(
+                Status.UNKNOWN, Remark(Reason.TOO_FAR, {"farthest_mm": self._farthest_mm})
+            )
+        return None

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context, JudgeInputs, Refusal, Stage
+from palpate.answer.pipeline import Context, StageInputs, Refusal, Stage
 from palpate.answer.window import TINY, Counts, Window
 from palpate.core.schema import Within, check
 from palpate.core.status import Reason, Remark
@@ -38,7 +38,7 @@ class Correlations:
         """Whether the correlations of a window are those of a slide."""
         return found[0] >= self.frames and found[1] >= self.taxels
 
-    def judges(self, given: JudgeInputs) -> list[Stage]:
+    def judges(self, given: StageInputs) -> list[Stage]:
         """Whether the counts move like noise."""
         return [NotNoise(self)]
 

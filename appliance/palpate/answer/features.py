@@ -126,11 +126,6 @@ def compute(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[np.float
     return KINDS[kind](taxels, rate_hz).astype(np.float32)
 
 
-def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
-    """Input of a graph of input `kind` for raw counts: the counts if "raw", otherwise `compute`."""
-    return taxels if kind == "raw" else compute(kind, taxels, rate_hz)
-
-
 def _clean(bins: float) -> float:
     """`bins` without rounding errors next to a whole number: 0.1 s at 30 Hz is 3 frames, not
     3.0000000000000004."""

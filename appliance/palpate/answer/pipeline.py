@@ -1,8 +1,7 @@
 """The way from a sweep to what is known of it: stages in one order, a file a rule.
 
 A stage looks at the sweep and at what earlier stages have found, adds what it finds, and may refuse
-the sweep; then no later stage sees it. Stages do not know each other. `inference.classifier` makes
-the stages of a bundle and states their order.
+the sweep; then no later stage sees it. Stages do not know each other; `rules` has their order.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.window import Window
 from palpate.core.status import Remark
-from palpate.core.types import Status, Sweep
+from palpate.core.types import Status, Sweep, SweepFormat
 
 Array = NDArray[Any]
 
@@ -111,16 +110,22 @@ class Context:
 
 
 @dataclass(frozen=True, slots=True)
-class JudgeInputs:
-    """Data that a rule may need with its parameters. labels: [K]. window: frames of a whole window.
+class StageInputs:
+    """Data that a rule may need with its parameters. labels: [K]. format: of the sweeps. contact:
+    least load of a taxel in contact, None if it is unknown. unloaded: whether training knew the
+    unloaded skin. speeds: whether answers have the speed. least: probability for status ok.
     decided: as of EnrolledLabels. beyond: see Disturbances. height: of the pattern in a sweep; None
     if slides on this skin cannot be measured."""
 
     labels: Sequence[str]
-    window: int
+    format: SweepFormat
+    contact: float | None
+    unloaded: bool
+    speeds: bool
+    least: float
     decided: Callable[[Array], Array]
-    beyond: Callable[[str, Mapping[str, float]], float]
-    height: Callable[[Context], float] | None
+    beyond: Callable[[str, Mapping[str, float]], float] = lambda name, values: 0.0
+    height: Callable[[Context], float] | None = None
 
 
 class Stage(Protocol):

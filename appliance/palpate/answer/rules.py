@@ -1,4 +1,5 @@
-"""The only list of the rules that a bundle may have, each with its parameters.
+"""The only list of the rules that a bundle may have, each with its parameters, and the order of the
+stages that they give.
 
 The module of the parameters has a twin, `fit_MODULE` in `palpate_train.answer`, that finds them.
 Parameters with `judges` give stages that follow the network.
@@ -6,18 +7,28 @@ Parameters with `judges` give stages that follow the network.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
-from palpate.answer.contact import ContactPositions
+from palpate.answer.contact import ContactPositions, DisplacementRule, LocateContact
 from palpate.answer.correlation import Correlations
-from palpate.answer.displacement import DisplacementRule
-from palpate.answer.disturbance import Disturbances
+from palpate.answer.disturbance import Disturbances, MeasureDisturbances, WasTried
 from palpate.answer.early import Early
-from palpate.answer.pipeline import JudgeInputs, Stage
-from palpate.answer.slide import SpeedRange
-from palpate.answer.taxels import Bridging
+from palpate.answer.hum import HumFilter
+from palpate.answer.objects import Certain, GivesNumbers, ObjectSweeps
+from palpate.answer.pipeline import Stage, StageInputs
+from palpate.answer.slide import MeasureSlide, SlideLimits, SpeedRange
+from palpate.answer.taxels import Bridging, TaxelWatch
 from palpate.answer.unknown import Known
-from palpate.answer.vibration import SlideLimits
+
+
+class Stages(NamedTuple):
+    """cleaning: what changes the counts. measuring: what else comes before the network. judging:
+    what looks at its answer."""
+
+    cleaning: list[Stage]
+    measuring: list[Stage]
+    judging: list[Stage]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +52,27 @@ class Rules:
     known: Known | None = None
     contact: ContactPositions | None = None
 
-    def judges(self, given: JudgeInputs) -> list[Stage]:
-        """The stages after the network."""
+    def stages(self, given: StageInputs, taxels: TaxelWatch, objects: ObjectSweeps) -> Stages:
+        """The stages of an answer, in the order in which they look at a sweep."""
+        able, disturbed = None, self.disturbances
+        cleaning, measuring = list[Stage]([taxels]), list[Stage]()
+        if disturbed and disturbed.hum:
+            cleaning.append(HumFilter(given.format, disturbed.hum))
+        if self.contact and given.contact is not None:
+            measuring.append(LocateContact(self.contact, given.contact))
+        pitch_mm = self.contact.pitch_mm if self.contact and given.speeds else None
+        wanted = bool(pitch_mm or disturbed)
+        if wanted or (self.sliding and self.sliding.pattern):
+            slide = MeasureSlide(given.format, pitch_mm, bridged=wanted)
+            measuring.append(slide)
+            able = slide.height if slide.able else None
+        if disturbed:
+            measuring.append(MeasureDisturbances(unloaded=given.unloaded))
+            if self.known:
+                measuring.append(WasTried(disturbed))
+        given = replace(given, height=able, beyond=(disturbed or Disturbances()).beyond)
         rules = [getattr(self, field.name) for field in fields(Rules)]
-        return [stage for rule in rules if hasattr(rule, "judges") for stage in rule.judges(given)]
+        judges = [one for of in rules if hasattr(of, "judges") for one in of.judges(given)]
+        displaced = max(given.least, self.displacement.unsure if self.displacement else 0.0)
+        judging = [GivesNumbers(), *judges, objects, Certain(given.least, displaced)]
+        return Stages(cleaning, measuring, judging)

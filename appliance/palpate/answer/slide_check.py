@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.slide import CHANCE, NO_PATTERN, SlideMeter
-from palpate.answer.vibration import PARTS, SlideLimits, vibration
+from palpate.answer.slide import CHANCE, NO_PATTERN, PARTS, SlideLimits, SlideMeter, vibration
 from palpate.answer.window import Window
 from palpate.core.types import SweepFormat, normal
 

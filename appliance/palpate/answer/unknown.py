@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.displacement import DisplacementRule
+from palpate.answer.contact import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError

@@ -27,8 +27,7 @@ from palpate.core.observer import Observer
 from palpate.core.schema import typed
 from palpate.core.statistics import wilson
 from palpate.core.types import Status, Sweep, Verdict
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sweeps.sweep_folder import SweepFolder
 
 FILE = "agreement.json"

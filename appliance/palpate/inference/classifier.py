@@ -13,30 +13,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer import features
-from palpate.answer.contact import LocateContact
-from palpate.answer.disturbance import Disturbances, MeasureDisturbances, WasTried
-from palpate.answer.hum import HumFilter
+from palpate.answer.early import EarlyNetwork
 from palpate.answer.objects import (
-    Certain,
     EnrolledLabels,
     FusedSweeps,
-    GivesNumbers,
     ObjectSweeps,
     softmax,
 )
-from palpate.answer.pipeline import Context, JudgeInputs, Stage, run
-from palpate.answer.slide import MeasureSlide
+from palpate.answer.pipeline import Context, Stage, StageInputs, run
 from palpate.answer.taxels import TaxelWatch
-from palpate.answer.unknown import ClassDistances, KnownMaterial
-from palpate.answer.window_check import MANY_FULL
+from palpate.answer.unknown import ClassDistances, EarlyDistances, KnownMaterial
+from palpate.answer.window import MANY_FULL
 from palpate.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from palpate.bundle.manifest import MEANS
 from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.errors import BundleError
 from palpate.core.observer import Observer
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from palpate.inference.session import ModelRunner
+from palpate.inference.session import ModelRunner, graph_input
 
 if TYPE_CHECKING:
     from palpate.core.clock import Clock
@@ -107,48 +101,22 @@ class Classifier(Observer):
         self._outputs = ("logits", *("embedding",) * (self._means is not None))
         # early heads get a session of their own
         self.model_runner = model or ModelRunner(bundle.model, *self._outputs)
-        self._cleaning: list[Stage] = [self.taxels]
-        if m.disturbances and m.disturbances.hum:
-            self._cleaning.append(HumFilter(m.format, m.disturbances.hum))
-        self._measuring, self._judging = self._measures(slides), self._judges()
+        given = StageInputs(
+            *(labels, m.format, m.thresholds.contact, bool(m.unloaded), slides, least),
+            enrolled.decided,
+        )
+        self._parts = m.stages(given, self.taxels, self._objects)
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
             displaced = class_distances(bundle, settings.strangers, displaced=True)
             network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
-        self._rehearsed = [*self._cleaning, *self._measuring, network[0]]
+        self._rehearsed = [*self._parts.cleaning, *self._parts.measuring, network[0]]
 
     def stages(self, *network: Stage) -> list[Stage]:
         """All stages in their order. network: give the logits and refuse unknown materials."""
-        return [*self._cleaning, *self._measuring, *network, *self._judging]
-
-    def _measures(self, slides: bool) -> list[Stage]:
-        """The stages before the network."""
-        m, stages = self.bundle.manifest, list[Stage]()
-        if m.contact and m.thresholds.contact is not None:
-            stages.append(LocateContact(m.contact, m.thresholds.contact))
-        pitch_mm = m.contact.pitch_mm if m.contact and slides else None
-        wanted, pattern = bool(pitch_mm or m.disturbances), m.sliding and m.sliding.pattern
-        self._slide = None
-        if wanted or pattern:
-            self._slide = MeasureSlide(m.format, pitch_mm, bridged=wanted)
-            stages.append(self._slide)
-        if m.disturbances:
-            stages.append(MeasureDisturbances(unloaded=bool(m.unloaded)))
-            if self._means:
-                stages.append(WasTried(m.disturbances))
-        return stages
-
-    def _judges(self) -> list[Stage]:
-        """The stages that look at the network's answer."""
-        m, least = self.bundle.manifest, self.settings.min_probability
-        beyond = (m.disturbances or Disturbances()).beyond
-        height = self._slide.height if self._slide and self._slide.able else None
-        given = JudgeInputs(
-            m.labels, m.format.window, self._objects.enrolled.decided, beyond, height
-        )
-        displaced = max(least, m.displacement.unsure if m.displacement else 0.0)
-        return [GivesNumbers(), *m.judges(given), self._objects, Certain(least, displaced)]
+        cleaning, measuring, judging = self._parts
+        return [*cleaning, *measuring, *network, *judging]
 
     @property
     def rule(self) -> dict[str, Any]:
@@ -203,7 +171,7 @@ class Classifier(Observer):
         """The named outputs of the graph for one window of raw counts [T, R, C] or [T, R, C, A],
         without the leading axis of length 1."""
         m = self.bundle.manifest
-        return self.model_runner(names, features.graph_input(m.input, taxels, m.format.rate_hz))
+        return self.model_runner(names, graph_input(m.input, taxels, m.format.rate_hz))
 
     def prepare(self, *outputs: str) -> None:
         """Open the session of these outputs now, so that the first sweep does not wait for it."""
@@ -279,7 +247,7 @@ class Classifier(Observer):
 
     def judged(self, sweep: Sweep, stages: Sequence[Stage]) -> Context:
         """The findings of the stages in one sweep; none if its status is not ok."""
-        whole = len(sweep.frames) == self.bundle.format.window
+        whole = len(sweep.frames) == self.bundle.manifest.format.window
         context = Context(sweep, sweep.frames.taxels, self.tare, whole, sweep.status)
         return run(stages, context) if sweep.status is Status.OK else context
 
@@ -295,7 +263,7 @@ class Classifier(Observer):
         """One window of raw counts [T, R, C] or [T, R, C, A] as the network sees it: broken taxels
         are bridged, and hum is removed."""
         context = self._context(taxels, self.tare)
-        for stage in self._cleaning:
+        for stage in self._parts.cleaning:
             stage.apply(context)
         return context.taxels
 
@@ -362,3 +330,43 @@ class NetworkStage:
         context.logits = found[0]
         if len(found) > 1:
             context.embedding = found[1]
+
+
+class EarlyExit:
+    """Answers unfinished sweeps. steps: number of times in a window at which it can answer.
+
+    Raises BundleError if the bundle has no early heads.
+    """
+
+    def __init__(self, classifier: Classifier) -> None:
+        manifest = classifier.bundle.manifest
+        if manifest.early is None:
+            raise BundleError(
+                f"bundle {manifest.name} {manifest.version} has no early heads, but "
+                "classifier.early is true; set classifier.early = false, or name a bundle that was "
+                "exported with them"
+            )
+        self._classifier, self.steps = classifier, len(manifest.early.least)
+        classes, limits = classifier.bundle.classes, manifest.early.limits
+        if manifest.known:  # the limits are strict already: a loose choice does not widen them
+            growth = min(1.0, manifest.known.growth(classifier.settings.strangers))
+            limits = tuple(growth * limit for limit in limits)
+        distances = EarlyDistances(classes.early, limits) if classes and classes.early else None
+        outputs = ("early", *("early_embedding",) * (distances is not None))
+        classifier.prepare(*outputs)
+
+        def network(taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
+            return classifier.outputs(taxels, *outputs)
+
+        window = manifest.format.window
+        self._stages = classifier.stages(EarlyNetwork(network, manifest.early, distances, window))
+
+    def __call__(self, sweep: Sweep) -> Verdict | None:
+        """The verdict on a sweep with share < 1, or None if the rest of the sweep is needed; then
+        the sweep is not counted. It passes the stages of a whole window."""
+        context = self.judged(sweep)
+        return self._classifier.verdict(context) if context.status is Status.OK else None
+
+    def judged(self, sweep: Sweep) -> Context:
+        """The findings of the stages in a sweep with share < 1."""
+        return self._classifier.unfinished(sweep, self._stages)

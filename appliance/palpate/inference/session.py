@@ -5,8 +5,11 @@ Errors of onnxruntime become BundleErrors. Only the outputs that are requested a
 
 from __future__ import annotations
 
+import ctypes
+import os
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import onnxruntime as ort
@@ -18,10 +21,12 @@ from palpate.bundle.onnx_check import check
 from palpate.bundle.pruning import prune
 from palpate.core.errors import BundleError, ModelError
 from palpate.core.types import native
-from palpate.inference.code_pages import give_back
 
 MOST_S = 3.0
 """Longest processor time for a sweep. The service's watchdog waits 10 s for the loop."""
+MADV_DONTNEED = 4
+"""From <sys/mman.h>; the same on all architectures."""
+MAPS = Path("/proc/self/maps")
 
 
 def session(model: bytes) -> ort.InferenceSession:
@@ -45,6 +50,32 @@ def session(model: bytes) -> ort.InferenceSession:
         raise BundleError(
             f"onnxruntime {ort.__version__} refuses the model: {why}; export it again"
         ) from e
+
+
+def give_back(library: str = "", maps: Path = MAPS) -> int:
+    """Release the code pages of the file `library`, or of all files, until they run again; returns
+    the bytes, 0 if there are none or Linux refuses.
+
+    Opening a model runs through most of onnxruntime's code once, to register its operators. These
+    15 MiB stay resident while memory is not short, and 3 MiB of Python and numpy after the imports.
+    Only executable pages that are not writable are released: they equal the file, so nothing can be
+    lost.
+    """
+    madvise = ctypes.CDLL(None).madvise
+    madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+    total, wanted = 0, os.path.realpath(library) if library else ""
+    for line in maps.read_text().splitlines() if maps.is_file() else []:
+        where, access, *_, name = line.split(maxsplit=5)
+        if access == "r-xp" and name.startswith("/") and wanted in ("", name):
+            start, end = (int(number, 16) for number in where.split("-"))
+            if madvise(start, end - start, MADV_DONTNEED) == 0:
+                total += end - start
+    return total
+
+
+def graph_input(kind: str, taxels: NDArray[Any], rate_hz: float) -> NDArray[Any]:
+    """Input of a graph of input `kind` for raw counts: the counts if "raw", else these features."""
+    return taxels if kind == "raw" else features.compute(kind, taxels, rate_hz)
 
 
 class ModelRunner:
@@ -101,7 +132,7 @@ def try_all(bundle: Bundle) -> None:
     rank = None if bundle.classes is None else bundle.classes.means.shape[1]
     patterns = check.expected(m, len(bundle.enrolled), rank)
     for window in bundle.golden:
-        numbers = features.graph_input(m.input, window, m.format.rate_hz)
+        numbers = graph_input(m.input, window, m.format.rate_hz)
         begun_s = time.process_time()
         values = run(opened, names, {opened.get_inputs()[0].name: numbers[None]})
         took_s = time.process_time() - begun_s

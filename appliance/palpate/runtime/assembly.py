@@ -23,8 +23,7 @@ from palpate.core.types import SweepFormat
 from palpate.deployment.sandbox import run_limited
 from palpate.deployment.signed import SignedBundle
 from palpate.deployment.store import Store
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.inference.session import try_all
 from palpate.io import skins
 from palpate.io.gpio_lines import Lines

@@ -22,8 +22,7 @@ from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
 from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.io.gpio_lines import Lines
 from palpate.io.robot_link import Command, Port, result
 from palpate.io.sensor import Sensor, SensorCounters

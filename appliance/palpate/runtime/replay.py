@@ -27,8 +27,7 @@ from palpate.core.schema import typed
 from palpate.core.text import printable, say
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.deployment.release_trial import OTHERWISE
-from palpate.inference.classifier import RULE, Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import RULE, Classifier, EarlyExit
 from palpate.io.robot_link import StdoutPort, result
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box

@@ -13,8 +13,7 @@ from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.errors import ApplianceError, PortError, SensorError, SensorMismatch
 from palpate.core.types import SweepFormat, shown
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.io import skin_profile, skins
 from palpate.io.gpio_lines import Lines
 from palpate.io.robot_link import SerialSink

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.slide_check import MANY, RESTS, Slid, SlideFinding, SlidesAmong, only_taxel
 from palpate.answer.unloaded import UnloadedTracker
-from palpate.answer.window import Window
-from palpate.answer.window_check import Finding, inspect_bare, inspect_readings
+from palpate.answer.window import Finding, Window, inspect_bare, inspect_readings
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.observer import Observer

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.answer.load_modes import LoadModes
-from palpate.answer.taxels import bridged
+from palpate.answer.taxels import LoadModes, bridged
 
 SPREAD = np.array([4.0, 8.0, 2.0, 6.0, 1.0, 5.0])
 TILT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])

@@ -13,8 +13,7 @@ from palpate.answer.early import Early
 from palpate.answer.taxels import CERTAIN, SOUND, Bridging, TaxelWatch
 from palpate.bundle import bundle
 from palpate.core.types import Status
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 from tests.factories.toy_bundle import frames_of, sweep_of

@@ -17,8 +17,7 @@ from palpate.answer.taxels import (
     find,
     places,
 )
-from palpate.answer.window import TRIPLES, Window
-from palpate.answer.window_check import WindowLimits
+from palpate.answer.window import TRIPLES, Window, WindowLimits
 from palpate.core.types import SweepFormat
 
 ROWS, COLS, FRAMES = 6, 5, 600

@@ -18,8 +18,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.learn import enrolment
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from palpate.answer.vibration import SlideLimits, vibration
+from palpate.answer.slide import SlideLimits, vibration
 
 TARE = np.full((2, 2), 20.0)
 

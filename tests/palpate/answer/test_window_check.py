@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.answer.unloaded import UnloadedSkin
-from palpate.answer.window import Window
-from palpate.answer.window_check import STAYS, ceiling, inspect, inspect_bare, inspect_readings
+from palpate.answer.window import STAYS, Window, ceiling, inspect, inspect_bare, inspect_readings
 from palpate.bundle.manifest import Thresholds
 from palpate.core.types import Status, shape
 

@@ -12,10 +12,8 @@ import pytest
 from palpate.answer.correlation import Correlations
 from palpate.answer.disturbance import Allowance, Disturbances
 from palpate.answer.early import Early
-from palpate.answer.load_modes import LoadModes
-from palpate.answer.slide import SpeedRange
-from palpate.answer.taxels import Bridging
-from palpate.answer.vibration import SlideLimits
+from palpate.answer.slide import SlideLimits, SpeedRange
+from palpate.answer.taxels import Bridging, LoadModes
 from palpate.bundle.manifest import Manifest
 from palpate.core.errors import BundleError
 from tests.factories import toy_bundle

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer import features, vibration
+from palpate.answer import features, slide
 from palpate.answer.early import Early
 from palpate.answer.objects import fuse, softmax
 from palpate.bundle import bundle
@@ -110,7 +110,7 @@ def test_a_machine_that_computes_the_checks_otherwise_is_refused(default_bundle,
     it = box(default_bundle)
     it.tare = it.tare + 200.0
     assert it.self_test() < bundle.GOLDEN_TOLERANCE
-    monkeypatch.setattr(vibration, "vibration", lambda *given: np.full(vibration.PARTS, -99.0))
+    monkeypatch.setattr(slide, "vibration", lambda *given: np.full(slide.PARTS, -99.0))
     with pytest.raises(BundleError, match="no-slide"):
         it.self_test()
     assert it.self_test(checks=False) < bundle.GOLDEN_TOLERANCE

@@ -12,8 +12,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state
 
 from palpate.bundle.bundle import Bundle
 from palpate.inference.classifier import Classifier
-from palpate.inference.code_pages import give_back
-from palpate.inference.session import session
+from palpate.inference.session import give_back, session
 from palpate.sim.rig import VirtualClock
 
 LIBRARY = os.path.realpath(onnxruntime_pybind11_state.__file__)

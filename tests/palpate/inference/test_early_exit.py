@@ -19,9 +19,8 @@ from palpate.cli.main import main
 from palpate.client.answers import Answer
 from palpate.core.config import ClassifierConfig, SweepConfig
 from palpate.core.types import SweepFormat, Verdict
-from palpate.inference import early_exit
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference import classifier
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime.loop import Box
 from palpate.sim import devices, gpio, rig, script, skin
@@ -175,7 +174,7 @@ def test_otherwise_the_answer_is_the_usual_one(rigged, sets, least):
 def test_no_choice_widens_the_limits_of_early_answers(default_bundle, monkeypatch):
     """A strict one narrows them as those of whole sweeps; a loose one leaves them."""
     given, clock = mock.Mock(), rig.VirtualClock()
-    monkeypatch.setattr(early_exit, "EarlyDistances", given)
+    monkeypatch.setattr(classifier, "EarlyDistances", given)
     for name in ("balanced", "loose", "strict"):
         EarlyExit(Classifier(default_bundle, clock, ClassifierConfig(strangers=name)))
     balanced, loose, strict = (call.args[1] for call in given.call_args_list)

@@ -12,15 +12,13 @@ import pytest
 
 from palpate.answer.disturbance import Allowance, Disturbances
 from palpate.answer.early import Early
-from palpate.answer.slide import NO_PATTERN
-from palpate.answer.vibration import SlideLimits
+from palpate.answer.slide import NO_PATTERN, SlideLimits
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.types import Frames, Status, Sweep
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle

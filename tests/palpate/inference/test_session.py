@@ -14,8 +14,7 @@ from palpate.bundle.onnx_check import reader
 from palpate.core.errors import BundleError, FormatError, ModelError
 from palpate.core.types import Status
 from palpate.inference import session
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.inference.session import ModelRunner
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle

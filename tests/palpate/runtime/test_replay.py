@@ -22,8 +22,7 @@ from palpate.core.errors import FormatError
 from palpate.core.sweep_file import save, sidecar
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.deployment import release_trial
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.runtime.replay import changed, main, replay
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.black_box import BlackBox

@@ -10,7 +10,7 @@ from palpate.answer.early import Early
 from palpate.answer.objects import softmax
 from palpate.answer.unknown import UNSURE
 from palpate_train.answer.calibrate import Calibration, fit_calibration
-from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_contact import AugmentedCopies
 from palpate_train.answer.fit_early import EarlyRule
 from palpate_train.data.run import Run
 from palpate_train.models.recipe import recipe

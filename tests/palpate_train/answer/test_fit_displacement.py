@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from palpate.answer.unknown import Classes
-from palpate_train.answer import embedding, fit_displacement
-from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer import embedding, fit_contact
+from palpate_train.answer.fit_contact import AugmentedCopies
 
 PLAIN = partial(embedding.embed, fixed=2)
 
@@ -36,7 +36,7 @@ def made(n: int = 20, wrong: float = 0.0):
     logits[others] = 1.2 * np.eye(3)[(truth[others] + 1) % 3]
     return (
         embedding.embed(x, labels, 2),
-        fit_displacement.fit(x, labels, groups, held, PLAIN, copied, logits),
+        fit_contact.fit(x, labels, groups, held, PLAIN, copied, logits),
         copied,
     )
 
@@ -65,7 +65,7 @@ def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
     """Ten in a hundred at .62 ask for more; none for none; half, surely wrong, for too much."""
     _, fit, _ = made()
     assert fit
-    assert (fit.rule.unsure, fit.rule.temperature) == (fit_displacement.UNSURE[0], 1)
+    assert (fit.rule.unsure, fit.rule.temperature) == (fit_contact.UNSURE[0], 1)
     _, fit, _ = made(wrong=0.1)
     assert fit
     assert 0.5 < fit.rule.unsure < 0.95
@@ -76,9 +76,9 @@ def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
     truth = labels[groups >= 6]
     logits = 40.0 * np.eye(3)[(truth + (np.arange(len(truth)) % 2)) % 3]
     logits[:, :] = np.where(logits > 0, 1e6, 0)
-    fit = fit_displacement.fit(x, labels, groups, groups >= 6, PLAIN, copied, logits)
+    fit = fit_contact.fit(x, labels, groups, groups >= 6, PLAIN, copied, logits)
     assert fit
-    assert fit.rule.unsure == fit_displacement.NEVER
+    assert fit.rule.unsure == fit_contact.NEVER
 
 
 def test_without_copies_that_judge_there_is_no_rule():
@@ -86,13 +86,13 @@ def test_without_copies_that_judge_there_is_no_rule():
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])
-    assert fit_displacement.fit(x, labels, groups, held, PLAIN, none, np.zeros((0, 3))) is None
+    assert fit_contact.fit(x, labels, groups, held, PLAIN, none, np.zeros((0, 3))) is None
     copied = AugmentedCopies(x, labels, np.arange(len(x)), held)
     logits = np.zeros((int(held.sum()), 3))
     lacking = copied.take((labels < 2) | held)
-    assert fit_displacement.fit(x, labels, groups, held, PLAIN, lacking, logits) is None
+    assert fit_contact.fit(x, labels, groups, held, PLAIN, lacking, logits) is None
     some = (labels < 2) | held
     assert (
-        fit_displacement.fit(x[some], labels[some], groups[some], held[some], PLAIN, copied, logits)
+        fit_contact.fit(x[some], labels[some], groups[some], held[some], PLAIN, copied, logits)
         is None
     )

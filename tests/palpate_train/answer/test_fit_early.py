@@ -93,7 +93,7 @@ def test_half_a_point_and_no_more(wrong: int, off: bool):
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
 def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
-    """early.decide equals inference.early_exit on random probabilities, some above 1."""
+    """early.decide equals inference.classifier on random probabilities, some above 1."""
     rng = np.random.default_rng(agree)
     p = softmax(2 * rng.standard_normal((200, 10, 3)))
     rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)

@@ -7,7 +7,7 @@ import pytest
 
 from palpate.answer.unknown import EarlyDistances
 from palpate.bundle import bundle
-from palpate_train.answer import fit_displacement, fit_early
+from palpate_train.answer import fit_contact, fit_early
 from palpate_train.data import sets
 
 
@@ -34,14 +34,14 @@ def test_limits_of_training_sweeps_are_told_where_there_is_a_rule():
     assert packaged.contact
     train = sets.load("sim:T-REAL/level-blind:41:2")
     without = replace(packaged.displacement, farthest_mm=None)
-    manifest = fit_displacement.limited(replace(packaged, displacement=without), train)
+    manifest = fit_contact.limited(replace(packaged, displacement=without), train)
     assert manifest.displacement
     copies_mm = manifest.displacement.farthest_mm - packaged.contact.limit_mm
     assert copies_mm == pytest.approx(1.9, abs=0.4)  # of a pitch of 4 mm
-    assert "up to" in fit_displacement.text(manifest)
+    assert "up to" in fit_contact.text(manifest)
     assert "9 steps" in fit_early.text(packaged)
     manifest = bundle.load(bundle.DEFAULT).manifest
     bare = replace(manifest, early=None, displacement=None)
-    assert fit_early.text(bare) == fit_displacement.text(bare) == ""
+    assert fit_early.text(bare) == fit_contact.text(bare) == ""
     sweeps = sets.load("sim:T-REAL/level-blind:41:1")
-    assert fit_displacement.limited(bare, sweeps) is bare
+    assert fit_contact.limited(bare, sweeps) is bare

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.answer import time_series
+from palpate.answer.slide import vibration
 from palpate.answer.unloaded import UnloadedSkin
-from palpate.answer.vibration import vibration
 from palpate.answer.window import Window
 from palpate.core.clock import SystemClock
 from palpate.core.types import SweepFormat

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.displacement import DisplacementRule
+from palpate.answer.contact import DisplacementRule
 from palpate.answer.early import Early
 from palpate.answer.objects import LEAST_PROBABILITY, softmax
 from palpate.answer.unknown import (
@@ -26,7 +26,7 @@ from palpate.answer.unknown import (
     shaped_distances,
 )
 from palpate.sweeps.sweep_folder import NOT_THIS
-from palpate_train.answer import fit_displacement, fit_early
+from palpate_train.answer import fit_contact, fit_early
 from palpate_train.answer.embedding import (
     NOTHING,
     Embedding,
@@ -37,7 +37,7 @@ from palpate_train.answer.embedding import (
     parts,
     shapes_without,
 )
-from palpate_train.answer.fit_displacement import AugmentedCopies, DisplacementFit
+from palpate_train.answer.fit_contact import AugmentedCopies, DisplacementFit
 from palpate_train.answer.fit_early import EarlyRule, Heads
 from palpate_train.answer.heads import HeadData, HeadPart, HeadPlan, condition_values
 from palpate_train.answer.stranger_limits import (
@@ -413,6 +413,6 @@ def _displacement(
     embedded = partial(embed, fixed=given.fixed, beyond=given.beyond)
     weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.held]))
     logits = (copied.features[copied.held] @ weight + bias) / temperature
-    return fit_displacement.fit(
+    return fit_contact.fit(
         given.whole, given.labels, given.groups, given.held, embedded, copied, logits, kept
     )

@@ -183,7 +183,7 @@ def decide(probabilities: Array, early: Early) -> tuple[Array, Array]:
     """The answers of the box and their times: probabilities [n, D + 1, K] -> labels [n], share of
     the window [n].
 
-    It decides as the appliance's inference.early_exit does, for many sweeps at once. The last
+    It decides as the appliance's inference.classifier does, for many sweeps at once. The last
     row, the whole window, always decides.
     """
     n, steps, _ = probabilities.shape

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from palpate.answer.pipeline import Slide
-from palpate.answer.slide import CHANCE, SlideMeter, SpeedRange
-from palpate.answer.vibration import PARTS, SlideLimits, vibration
+from palpate.answer.slide import CHANCE, PARTS, SlideLimits, SlideMeter, SpeedRange, vibration
 from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest

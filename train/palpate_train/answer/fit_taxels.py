@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.load_modes import LoadModes
-from palpate.answer.taxels import Bridging, Comparison, places
-from palpate.answer.vibration import PARTS
+from palpate.answer.slide import PARTS
+from palpate.answer.taxels import Bridging, Comparison, LoadModes, places
 from palpate.answer.window import Window
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest

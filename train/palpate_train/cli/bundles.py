@@ -20,7 +20,7 @@ from palpate.core.text import say
 from palpate.inference.classifier import Classifier
 from palpate_train.answer import (
     altered_sweeps,
-    fit_displacement,
+    fit_contact,
     fit_early,
     fit_slide,
     fit_taxels,
@@ -174,7 +174,7 @@ def _print(manifest: Manifest, out: Path) -> None:
     say(*stranger_limits.lines(manifest.figures))
     if manifest.known:
         say(*altered_sweeps.text(manifest.figures).split("\n"))
-    for part in (quantized_bundle, fit_early, fit_displacement, fit_slide, rules):
+    for part in (quantized_bundle, fit_early, fit_contact, fit_slide, rules):
         if text := part.text(manifest):
             say(*text.split("\n"))
     if few := [

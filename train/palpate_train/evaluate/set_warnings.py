@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.window_check import WindowLimits
+from palpate.answer.window import WindowLimits
 from palpate.core.status import Status
-from palpate_train.answer import fit_window_check
+from palpate_train.answer import fit_window
 from palpate_train.answer.fit_contact import find_limit
 from palpate_train.data import repeats
 from palpate_train.data.readers import counted
@@ -42,11 +42,11 @@ def _refused(sweeps: Dataset) -> Iterator[str]:
     which no figure of a fit contains. It bridges some broken taxels only where export proves that
     this pays."""
     limit = find_limit(sweeps)
-    limits = WindowLimits(limit.contact, fit_window_check.highest_count(sweeps))
-    found = fit_window_check.findings(sweeps, limits, limit.tare)
+    limits = WindowLimits(limit.contact, fit_window.highest_count(sweeps))
+    found = fit_window.findings(sweeps, limits, limit.tare)
     refused = Counter(str(one.status) for one in found if one.status is not Status.OK)
     if refused:
-        few = refused.total() <= fit_window_check.MOST_REFUSED * len(sweeps)
+        few = refused.total() <= fit_window.MOST_REFUSED * len(sweeps)
         does = (
             "the box would refuse them unless it may bridge their taxels; drop them"
             if few

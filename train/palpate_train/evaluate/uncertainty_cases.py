@@ -27,7 +27,7 @@ from palpate_train.answer.calibrate import (
     fit_novelty,
 )
 from palpate_train.answer.embedding import Embedding
-from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_contact import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
 from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.data.sets import Dataset, digest, join

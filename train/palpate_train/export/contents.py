@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from palpate.answer.displacement import DisplacementRule
+from palpate.answer.contact import DisplacementRule
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.early import Early
 from palpate.answer.objects import softmax

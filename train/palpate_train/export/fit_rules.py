@@ -22,7 +22,7 @@ from palpate_train.answer import (
     fit_early,
     fit_slide,
     fit_taxels,
-    fit_window_check,
+    fit_window,
     rules,
     stranger_limits,
 )
@@ -151,7 +151,7 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
     train, contacts = content.train, content.contacts or Contacts.of(content.train)
     place = contacts.positions(pitch_mm)
     limits = replace(manifest.thresholds, contact=contacts.limit.contact)
-    limits = fit_window_check.fitted(limits, (train, content.held_out), contacts.limit.tare)
+    limits = fit_window.fitted(limits, (train, content.held_out), contacts.limit.tare)
     speeds, unmeasured = fit_slide.trained_speeds(train, place.pitch_mm if place else None)
     unknown = {"contact": contacts.limit.why, "speeds": unmeasured}
     manifest = replace(

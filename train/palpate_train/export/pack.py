@@ -26,7 +26,7 @@ from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
-from palpate_train.answer.fit_window_check import MOST_REFUSED, highest_count
+from palpate_train.answer.fit_window import MOST_REFUSED, highest_count
 from palpate_train.answer.rules import ALL, Asked, present
 from palpate_train.answer.stranger_limits import MOST_UNKNOWN
 from palpate_train.data import extras, repeats

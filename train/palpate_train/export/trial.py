@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from palpate.bundle.contents import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status, digitized
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate_train.answer.altered_sweeps import altered_copies
 from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.data.augment import Augmentation, augment

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep, Verdict
-from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit
+from palpate.inference.classifier import Classifier, EarlyExit
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.metrics.answers import REFUSED, UNKNOWN, Answers, outcomes
 from palpate_train.metrics.score import interval, provenance, score_entry

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer import features
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.provenance import processor
-from palpate.inference.session import session
+from palpate.inference.session import graph_input, session
 from palpate_studies import cost, precisions
 from palpate_studies.development_chart import ANSWER, SERIES, TACTILE
 from palpate_studies.development_experiment import CASES, OURS
@@ -191,6 +190,4 @@ def _graph(method: Method, graph: bytes, rate_hz: float) -> measure.Call:
     """Features and graph, which answer raw counts [T, R, C]."""
     run = session(graph)
     name = run.get_inputs()[0].name
-    return lambda counts: run.run(
-        None, {name: features.graph_input(method.input, counts, rate_hz)[None]}
-    )
+    return lambda counts: run.run(None, {name: graph_input(method.input, counts, rate_hz)[None]})

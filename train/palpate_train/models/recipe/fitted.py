@@ -25,8 +25,7 @@ from palpate.core.sweep_set import read
 from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
-from palpate_train.answer.fit_contact import Contacts
-from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_contact import AugmentedCopies, Contacts
 from palpate_train.answer.fit_early import no_limits
 from palpate_train.answer.heads import HeadData, HeadPlan
 from palpate_train.data.augment import COPIES, Augmentation, copies

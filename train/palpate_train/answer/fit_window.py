@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.window_check import Finding, WindowLimits, inspect
+from palpate.answer.window import Finding, WindowLimits, inspect
 from palpate.core.types import Status
 from palpate_train.answer import embedding
 from palpate_train.data.sets import Dataset
