@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,7 +27,9 @@ MOST_S = 3.0
 """Longest processor time for a sweep. The service's watchdog waits 10 s for the loop."""
 MADV_DONTNEED = 4
 """From <sys/mman.h>; the same on all architectures."""
-MAPS = Path("/proc/self/maps")
+MAPS = Path("/proc/self/smaps")
+MAPPED = re.compile(r"(?m)^(\w+)-(\w+) r-[x-]p .* (/.*)\n(?:\w+:.*\n)*?Anonymous: *(\d+)")
+"""Start, end, file and written KiB of a part of a file in memory that is not writable."""
 
 
 def session(model: bytes) -> ort.InferenceSession:
@@ -53,23 +56,22 @@ def session(model: bytes) -> ort.InferenceSession:
 
 
 def give_back(library: str = "", maps: Path = MAPS) -> int:
-    """Release the code pages of the file `library`, or of all files, until they run again; returns
+    """Release the pages of the file `library`, or of all files, until they are used again; returns
     the bytes, 0 if there are none or Linux refuses.
 
-    Opening a model runs through most of onnxruntime's code once, to register its operators. These
-    15 MiB stay resident while memory is not short, and 3 MiB of Python and numpy after the imports.
-    Only executable pages that are not writable are released: they equal the file, so nothing can be
-    lost.
+    Opening a model runs through most of onnxruntime's code once, to register its operators, and
+    loading a library reads its names. These 20 MiB stay resident while memory is not short. Only
+    pages that are not writable and never were written are released: they equal the file, so nothing
+    can be lost.
     """
     madvise = ctypes.CDLL(None).madvise
     madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
     total, wanted = 0, os.path.realpath(library) if library else ""
-    for line in maps.read_text().splitlines() if maps.is_file() else []:
-        where, access, *_, name = line.split(maxsplit=5)
-        if access == "r-xp" and name.startswith("/") and wanted in ("", name):
-            start, end = (int(number, 16) for number in where.split("-"))
-            if madvise(start, end - start, MADV_DONTNEED) == 0:
-                total += end - start
+    found = MAPPED.findall(maps.read_text()) if maps.is_file() else []
+    for start, end, name, written in found:
+        first, size = int(start, 16), int(end, 16) - int(start, 16)
+        if wanted in ("", name) and written == "0" and not madvise(first, size, MADV_DONTNEED):
+            total += size
     return total
 
 
