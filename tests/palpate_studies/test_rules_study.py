@@ -11,6 +11,7 @@ from palpate_studies.command import main
 from palpate_train.answer import rules
 from palpate_train.data import sets
 from palpate_train.export import trial
+from tests.factories.paths import ROOT
 
 pytestmark = pytest.mark.slow  # the fixture answers each sweep without each rule
 SLIDES, MOVED = "sim:T-REAL/level-blind:101:1", "sim:T-HARD/level-blind:101:1"
@@ -68,3 +69,28 @@ def test_the_command_writes_its_results(
     assert found["sets"] == [SLIDES, MOVED]
     assert found["rows"][0]["total"]["displaced"] == 7
     assert "| hum |" in capsys.readouterr().out
+
+
+def test_each_rule_says_what_it_buys():
+    """The text of its module has the counts of docs/data/rules.json."""
+    rows = {
+        tuple(row["without"]): row
+        for row in json.loads((ROOT / "docs/data/rules.json").read_text())["rows"]
+    }
+    texts = " ".join(
+        " ".join(path.read_text().split())
+        for path in (ROOT / "appliance/palpate/answer").glob("*.py")
+    )
+    whole = rows[()]
+    for name in rules.RULES:
+        if (without := rows[name,])["right"] == whole["right"]:
+            continue  # early answers are none of whole sweeps
+        said = [
+            f"{without[how][of]} instead of {whole[how][of]} of {whole['total'][of]} {words}"
+            for how, of, words in (
+                ("right", "altered", "altered slides right"),
+                ("right", "displaced", "displaced ones"),
+                ("wrong", "junk", "junk windows named"),
+            )
+        ]
+        assert f"Without {name}: {', '.join(said)};" in texts

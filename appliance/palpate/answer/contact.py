@@ -6,6 +6,10 @@ them many times per second to show it. If the contact extends beyond the skin's 
 measures that part, so the computed centre is too close to the middle of the skin. The distance is
 then too small but never has the wrong sign, so following it and measuring again leads to the right
 position. For a skin with several axes only the normal axis counts.
+
+Without displacement: 747 instead of 747 of 816 altered slides right, 141 instead of 177 of 192
+displaced ones, 52 instead of 52 of 480 junk windows named; 5 us less of 646 (`python -m
+palpate_studies rules`).
 """
 
 from __future__ import annotations

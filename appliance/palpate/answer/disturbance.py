@@ -2,7 +2,11 @@
 
 Each moves the embedding of a known material further than the limit of known materials. Its size is
 known, so the means of the materials move with it and the limit grows with it. A sweep without
-disturbance is judged as before. docs/decisions/0005 has the gain and the cost.
+disturbance is judged as before.
+
+Without disturbance: 673 instead of 747 of 816 altered slides right, 177 instead of 177 of 192
+displaced ones, 39 instead of 52 of 480 junk windows named; 9 us less of 646 (`python -m
+palpate_studies rules`).
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 The bundle's graph has a head for each step of the window. `Early` holds the least probability at
 which each head may answer.
+
+Whole answers are the same without it; the card of a bundle says at which share of the sweep it
+answers, and what that loses.
 """
 
 from __future__ import annotations

@@ -5,6 +5,10 @@ have in phase. A network may not respond to 50 Hz and yet see other counts, beca
 small vibrations that are rounded. A texture can be periodic as well. Hum is therefore removed only
 if one of its lines stands out more than in any training sweep. An unfinished window shows hum as
 soon as it is long enough for a line. Functions of raw counts; windows of one format.
+
+Without hum: 728 instead of 747 of 816 altered slides right, 177 instead of 177 of 192 displaced
+ones, 52 instead of 52 of 480 junk windows named; 60 us less of 646 (`python -m palpate_studies
+rules`).
 """
 
 from __future__ import annotations

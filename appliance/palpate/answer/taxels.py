@@ -4,8 +4,12 @@ A silent taxel does not change although its neighbours do, or gives no number: i
 A noisy taxel is far noisier than its neighbours. A few modes, such as more force or a contact
 further along, describe the loads of all taxels in training, so that sound taxels tell the load of a
 broken one: probabilistic principal components (Tipping and Bishop, Journal of the Royal Statistical
-Society B, 1999). All limits were learned from the training sweeps
-of the bundle (train/palpate_train/answer/fit_taxels).
+Society B, 1999). All limits were learned from the training sweeps of the bundle
+(train/palpate_train/answer/fit_taxels).
+
+Without taxels: 625 instead of 747 of 816 altered slides right, 177 instead of 177 of 192 displaced
+ones, 52 instead of 52 of 480 junk windows named; 33 us less of 646 (`python -m palpate_studies
+rules`).
 """
 
 from __future__ import annotations

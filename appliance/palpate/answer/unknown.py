@@ -3,6 +3,10 @@
 The embedding is scaled so that the sweeps of all materials together have covariance 1 around their
 means. A squared distance in it is therefore a squared Mahalanobis distance, and the nearest mean
 gives the label. An enrolled material is one more mean; nothing is trained for it.
+
+Without unknown: 769 instead of 747 of 816 altered slides right, 178 instead of 177 of 192 displaced
+ones, 115 instead of 52 of 480 junk windows named; 31 us less of 646 (`python -m palpate_studies
+rules`).
 """
 
 from __future__ import annotations

@@ -18,17 +18,14 @@ BLOCK_S, LEAST_FRAMES = 0.1, 8
 """Length of the stretches that are compared. Between two sweeps a finger is lifted for longer."""
 NOISE = 5.0
 """A mean over time is a load if it differs from the unloaded skin by this many standard deviations
-of one frame."""
+of one frame, and certainly if it differs by as many times this load."""
 LEAST_COUNTS = 2.0
 """The same for whole counts, whose noise may be below one count."""
 QUIET = 2.0
 """Stretches whose noise differs by at most this factor are equally quiet."""
-TOUCH = 5.0
-"""A stretch that differs by this many times the least load was certainly a touch."""
-
-LEAST_SHARE = 0.1
-"""A stretch counts as lower than another from this share of the least load on; a smaller difference
-is noise."""
+SHARE = 0.1
+"""Less than this share of a load is none: a stretch that is lower by less than this of the least
+load is as low, a taxel with less than this of the strongest is not loaded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +94,7 @@ class UnloadedTracker:
             return
         away = normal(np.abs(block.level - self.skin.level), 0)
         self.certain |= bool(
-            away.max(initial=0, where=np.isfinite(away)) >= TOUCH * self.skin.contact
+            away.max(initial=0, where=np.isfinite(away)) >= NOISE * self.skin.contact
         )
 
     @staticmethod
@@ -105,9 +102,7 @@ class UnloadedTracker:
         """Whether a stretch is less loaded than another: much quieter, or as quiet and lower."""
         if block.contact * QUIET < than.contact:
             return True
-        lower = (
-            float(np.nanmean(normal(block.level - than.level, 0))) < -LEAST_SHARE * block.contact
-        )
+        lower = float(np.nanmean(normal(block.level - than.level, 0))) < -SHARE * block.contact
         return lower and block.contact <= QUIET * than.contact
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.unloaded import QUIET, UnloadedSkin
+from palpate.answer.unloaded import QUIET, SHARE, UnloadedSkin
 from palpate.core.schema import MOST, Positive, Within
 from palpate.core.status import Reason, Remark
 from palpate.core.types import LARGEST_READING, Status, normal
@@ -27,9 +27,6 @@ TINY = 1e-30
 """Replaces 0 as a divisor, or where a logarithm is taken."""
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
 """Highest counts of common converters; a skin does not announce its own."""
-SHARE = 0.1
-"""A loaded taxel has at least this share of the load of the strongest taxel, as in the limits of a
-bundle (train/palpate_train/export/pack)."""
 MANY_FULL = 0.01
 """With a larger share of the counts at full scale a window is saturated, unless export has proven
 more for the bundle."""

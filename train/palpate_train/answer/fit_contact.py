@@ -28,8 +28,7 @@ from palpate.answer.contact import (
 )
 from palpate.answer.objects import softmax
 from palpate.answer.unknown import Classes, DisplacedClasses
-from palpate.answer.unloaded import UnloadedSkin
-from palpate.answer.window import SHARE
+from palpate.answer.unloaded import SHARE, UnloadedSkin
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.types import normal
