@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context, StageInputs, Refusal, Stage
+from palpate.answer.pipeline import Context, Refusal, Stage, StageInputs
 from palpate.answer.window import TINY, Counts, Window
 from palpate.core.schema import Within, check
 from palpate.core.status import Reason, Remark

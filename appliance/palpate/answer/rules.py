@@ -23,8 +23,8 @@ from palpate.answer.unknown import Known
 
 
 class Stages(NamedTuple):
-    """cleaning: what changes the counts. measuring: what else comes before the network. judging:
-    what looks at its answer."""
+    """cleaning: change the counts. measuring: the others before the network. judging: look at its
+    answer."""
 
     cleaning: list[Stage]
     measuring: list[Stage]

@@ -360,7 +360,8 @@ class KnownMaterial:
         novelty = means.novelty(z, context.disturbed)
         if novelty is None:
             return None
-        if not off and (alike := self._unknown.put(context.sweep.id, z)):
+        # a golden sweep has no number, and nobody touched it
+        if not off and context.sweep.id and (alike := self._unknown.put(context.sweep.id, z)):
             again = Remark(Reason.UNLIKE_ALL_AGAIN, novelty | {"sweep": alike})
             return Refusal(Status.UNKNOWN, again)
         return Refusal(Status.UNKNOWN, Remark(Reason.UNLIKE_ALL, novelty))

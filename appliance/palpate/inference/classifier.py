@@ -111,7 +111,6 @@ class Classifier(Observer):
             displaced = class_distances(bundle, settings.strangers, displaced=True)
             network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
-        self._rehearsed = [*self._parts.cleaning, *self._parts.measuring, network[0]]
 
     def stages(self, *network: Stage) -> list[Stage]:
         """All stages in their order. network: give the logits and refuse unknown materials."""
@@ -268,8 +267,12 @@ class Classifier(Observer):
         return context.taxels
 
     def rehearse(self) -> None:
-        """Run the stages up to the network on a golden sweep. The result is dropped."""
-        run(self._rehearsed, self._context(self.bundle.golden[0], self.tare))
+        """Answer a golden sweep, as if there had been none. The result is dropped."""
+        present = self._objects.present
+        try:
+            self.verdict(run(self._stages, self._context(self.bundle.golden[0], self.tare)))
+        finally:
+            self._objects.present = present
 
     def _context(self, taxels: NDArray[Any], tare: NDArray[Any]) -> Context:
         """The context of a whole window without a sweep."""

@@ -71,6 +71,17 @@ def test_a_rehearsal_leaves_no_trace(default_bundle):
         np.testing.assert_array_equal(now.scores, want.scores)
 
 
+def test_an_unknown_golden_sweep_is_none_that_came_before(default_bundle):
+    """Neither its rehearsal nor the check of refusals makes it a sweep that a person saw."""
+    both = default_bundle.golden[:2].astype(np.float64).mean(axis=0).astype(np.uint8)
+    it = Classifier(replace(default_bundle, golden=both[None]), VirtualClock())
+    it.rehearse()
+    assert it.refusals() == [Status.UNKNOWN]
+    details = [it(replace(sweep_of(both), id=number)).detail for number in (1, 2)]
+    assert ["as sweep" in detail for detail in details] == [False, True]
+    assert details[1].endswith("as sweep 1")
+
+
 @pytest.fixture
 def toy_folder(tmp_path: Path) -> Path:
     """The folder of a toy bundle, to be damaged."""

@@ -39,7 +39,7 @@ def limits(train: Dataset, held_out: Dataset, seed: int = 0) -> Correlations:
 
 
 def without(bundle: Bundle) -> Bundle:
-    """The bundle that answers what moves like noise."""
+    """The bundle without the rule against noise."""
     return replace(bundle, manifest=replace(bundle.manifest, correlations=None))
 
 

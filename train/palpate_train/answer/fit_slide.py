@@ -1,6 +1,5 @@
-"""What the slides of a training set have in common: the range of their speeds, and what tells them
-from a rest, the least vibration of each material and the least pattern that passes from taxel to
-taxel. All is measured from counts."""
+"""The slides of a training set: the range of their speeds, the least vibration of each material and
+the least pattern that passes from taxel to taxel. All is measured from counts."""
 
 from __future__ import annotations
 
