@@ -19,7 +19,6 @@ SOURCES = sorted(
 )
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
 TEST_FILES = [path for path in TESTS if path.name.startswith("test_")]
-GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cuts")]
 BOX = [
     p for p in SOURCES if p.is_relative_to(ROOT / "appliance" / "palpate") and "sim" not in p.parts
 ]
@@ -47,8 +46,6 @@ EXTRAS = {
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
 }
 """What a package or module imports beside that, of an extra; it is loaded for this alone."""
-LONGEST = 500
-"""Lines of a module, about."""
 
 
 def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
@@ -104,19 +101,19 @@ def module_imports(*packages: str) -> dict[str, set[str]]:
     return {name: imported & dotted.keys() - {name} for name, imported in found.items()}
 
 
-def circles(graph: dict[str, set[str]]) -> list[str]:
-    """The modules that reach themselves, with the imports that lead to them."""
-    left, kept = {}, graph
-    while kept != left:  # a module is in no circle if it imports or serves nothing of the rest
-        left, imported = kept, set().union(*kept.values())
-        kept = {name: names & left.keys() for name, names in left.items() if name in imported}
-        kept = {name: names for name, names in kept.items() if names}
-    return [f"{name} -> {', '.join(sorted(names))}" for name, names in sorted(kept.items())]
-
-
 @pytest.mark.slow
 def test_no_module_imports_itself_through_others():
     """Type hints and functions included; one that is there would be found."""
+
+    def circles(graph: dict[str, set[str]]) -> list[str]:
+        """The modules that reach themselves, with the imports that lead to them."""
+        left, kept = {}, graph
+        while kept != left:  # a module is in no circle if it imports or serves nothing of the rest
+            left, imported = kept, set().union(*kept.values())
+            kept = {name: names & left.keys() for name, names in left.items() if name in imported}
+            kept = {name: names for name, names in kept.items() if names}
+        return [f"{name} -> {', '.join(sorted(names))}" for name, names in sorted(kept.items())]
+
     graph = module_imports("palpate", "palpate_train", "palpate_studies")
     assert "palpate.core.errors" in graph["palpate.deployment.store"]
     assert circles(graph) == []
@@ -144,20 +141,20 @@ def test_every_module_of_training_serves_a_command():
     assert modules - found == set()
 
 
-def foreign(path: Path) -> set[str]:
-    """The modules that a file of the box imports and may not import."""
-    extras = (
-        names
-        for part, names in EXTRAS.items()
-        if path.is_relative_to(ROOT / "appliance" / "palpate" / part)
-    )
-    allowed = ALLOWED.union(sys.stdlib_module_names, *extras)
-    return {name for name in imports(path) if name.split(".")[0] not in allowed}
-
-
 @pytest.mark.slow
 def test_the_box_imports_five_libraries():
     """And itself by full names; a library of an extra only where that is for."""
+
+    def foreign(path: Path) -> set[str]:
+        """The modules that a file of the box imports and may not import."""
+        extras = (
+            names
+            for part, names in EXTRAS.items()
+            if path.is_relative_to(ROOT / "appliance" / "palpate" / part)
+        )
+        allowed = ALLOWED.union(sys.stdlib_module_names, *extras)
+        return {name for name in imports(path) if name.split(".")[0] not in allowed}
+
     assert {shown(path): names for path in BOX if (names := foreign(path))} == {}
     assert foreign(ROOT / "train" / "palpate_train" / "models" / "training.py") >= {"torch"}
 
@@ -220,24 +217,27 @@ def test_onnxruntime_starts_no_thread_of_its_own():
     assert run(sys.executable, "-c", code, cwd=ROOT, env=env).splitlines()[-1] == "1"
 
 
-def too_long(path: Path) -> list[str]:
-    """The functions of 40 lines and more, without their docstrings."""
-    found = []
-    for node in nodes(path):
-        if isinstance(node, ast.FunctionDef):
-            body = node.body[1:] if ast.get_docstring(node) else node.body
-            lines = node.end_lineno - body[0].lineno + 1 if body else 0
-            if lines >= 40:
-                found.append(f"{shown(path)}: {node.name} has {lines} lines")
-    return found
-
-
 @pytest.mark.slow
 def test_modules_and_functions_are_short():
     """Modules have at most 500 lines, functions under 40 lines of code."""
-    paths = [path for path in [*SOURCES, *GROUNDS] if not path.name.startswith("test_")]
+
+    def too_long(path: Path) -> list[str]:
+        """The functions of 40 lines and more, without their docstrings."""
+        found = []
+        for node in nodes(path):
+            if isinstance(node, ast.FunctionDef):
+                body = node.body[1:] if ast.get_docstring(node) else node.body
+                lines = node.end_lineno - body[0].lineno + 1 if body else 0
+                if lines >= 40:
+                    found.append(f"{shown(path)}: {node.name} has {lines} lines")
+        return found
+
+    # Lines of a module, about
+    longest = 500
+    grounds = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cuts")]
+    paths = [path for path in [*SOURCES, *grounds] if not path.name.startswith("test_")]
     sizes = {shown(path): len(path.read_text().splitlines()) for path in paths}
-    assert {path: lines for path, lines in sizes.items() if lines > LONGEST} == {}
+    assert {path: lines for path, lines in sizes.items() if lines > longest} == {}
     assert [line for path in paths for line in too_long(path)] == []
 
 
@@ -266,18 +266,24 @@ def test_dataclasses_with_arrays_are_not_compared_by_value():
     assert found == []
 
 
-CHANGING = {
-    *("Agreement", "AnswerScore", "Context", "EdgeCounters", "Finger", "OpenSweep", "Reception"),
-    *("Gathering", "SensorCounters", "_Line"),
-}
-"""Dataclasses of the box that count or collect; every other one is a value."""
-
-
 def test_values_of_the_box_do_not_change():
     """Each dataclass is frozen and takes no other attribute; LeRobot and a cached part want two."""
+    # Dataclasses of the box that count or collect; every other one is a value
+    changing = {
+        *(
+            "Agreement",
+            "AnswerScore",
+            "Context",
+            "EdgeCounters",
+            "Finger",
+            "OpenSweep",
+            "Reception",
+        ),
+        *("Gathering", "SensorCounters", "_Line"),
+    }
     written = re.compile(r"(?m)^ *@dataclass\((.*)\)\n *class (\w+)")
     found = {
-        name: (name not in CHANGING, True) == ("frozen=True" in how, "slots=True" in how)
+        name: (name not in changing, True) == ("frozen=True" in how, "slots=True" in how)
         for path in sorted((ROOT / "appliance").rglob("*.py"))
         for how, name in written.findall(path.read_text())
     }
@@ -301,36 +307,36 @@ def test_every_test_says_what_it_holds():
     assert [name for name, test in written_tests() if not ast.get_docstring(test)] == []
 
 
-def asserts(test: ast.FunctionDef) -> bool:
-    """Whether a test can fail: assert, pytest.raises, fail, warns, or a checking helper."""
-    if any(isinstance(node, ast.Assert) for node in ast.walk(test)):
-        return True
-    calls = [ast.unparse(node.func) for node in ast.walk(test) if isinstance(node, ast.Call)]
-    judges = re.compile(r"(.*\.)?(raises|fail|warns|_?check|_?(check|assert|expect)_\w+)")
-    return any(map(judges.fullmatch, calls))
-
-
 @pytest.mark.slow
 def test_every_test_asserts():
     """Each asserts, or calls a helper named check_, assert_ or expect_."""
+
+    def asserts(test: ast.FunctionDef) -> bool:
+        """Whether a test can fail: assert, pytest.raises, fail, warns, or a checking helper."""
+        if any(isinstance(node, ast.Assert) for node in ast.walk(test)):
+            return True
+        calls = [ast.unparse(node.func) for node in ast.walk(test) if isinstance(node, ast.Call)]
+        judges = re.compile(r"(.*\.)?(raises|fail|warns|_?check|_?(check|assert|expect)_\w+)")
+        return any(map(judges.fullmatch, calls))
+
     assert [name for name, test in written_tests() if not asserts(test)] == []
-
-
-def endless(node: ast.AST) -> bool:
-    """Whether a node runs a program, or waits for its end, without a limit of time."""
-    if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
-        return False
-    if any(keyword.arg in ("timeout", None) for keyword in node.keywords):
-        return False
-    name = ast.unparse(node.func)
-    return node.func.attr == "communicate" or bool(
-        re.fullmatch(r"subprocess\.(run|call|check_call|check_output)", name)
-    )
 
 
 @pytest.mark.slow
 def test_no_test_waits_for_a_program_without_a_limit():
     """Each program that a test or a factory runs to its end has a timeout."""
+
+    def endless(node: ast.AST) -> bool:
+        """Whether a node runs a program, or waits for its end, without a limit of time."""
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+            return False
+        if any(keyword.arg in ("timeout", None) for keyword in node.keywords):
+            return False
+        name = ast.unparse(node.func)
+        return node.func.attr == "communicate" or bool(
+            re.fullmatch(r"subprocess\.(run|call|check_call|check_output)", name)
+        )
+
     assert endless(ast.parse("subprocess.run(['true'])").body[0].value)
     paths = [p for p in TESTS if p in TEST_FILES or p.parent.name == "factories"]
     found = [

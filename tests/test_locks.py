@@ -31,27 +31,27 @@ def entries(lock: str) -> dict[str, list[str]]:
     return found
 
 
-def wanted(extras: Iterable[str]) -> Iterator[str]:
-    """Names of the packages that the two distributions ask for in these extras."""
-    asked: list[str] = []
-    for file in ("pyproject.toml", "train/pyproject.toml"):
-        project = tomllib.loads((ROOT / file).read_text())["project"]
-        of_it = project["optional-dependencies"]
-        asked += (
-            project["dependencies"] if not file.startswith("train") or "train" in extras else []
-        )
-        asked += [each for extra in extras for each in of_it.get(extra, [])]
-    for requirement in map(Requirement, asked):
-        if requirement.name.startswith("palpate"):
-            yield from wanted(requirement.extras)
-        elif requirement.name != "torch":
-            yield canonicalize_name(requirement.name)
-
-
 @pytest.mark.parametrize("lock", LOCKS)
 def test_every_package_is_locked_with_hashes(lock: str):
     """Every requirement is in the lock of its environment, with one version and its hashes. PyTorch
     is left out, because its builds differ between machines."""
+
+    def wanted(extras: Iterable[str]) -> Iterator[str]:
+        """Names of the packages that the two distributions ask for in these extras."""
+        asked: list[str] = []
+        for file in ("pyproject.toml", "train/pyproject.toml"):
+            project = tomllib.loads((ROOT / file).read_text())["project"]
+            of_it = project["optional-dependencies"]
+            asked += (
+                project["dependencies"] if not file.startswith("train") or "train" in extras else []
+            )
+            asked += [each for extra in extras for each in of_it.get(extra, [])]
+        for requirement in map(Requirement, asked):
+            if requirement.name.startswith("palpate"):
+                yield from wanted(requirement.extras)
+            elif requirement.name != "torch":
+                yield canonicalize_name(requirement.name)
+
     found = entries(lock)
     for name, of_it in found.items():
         for entry in of_it:

@@ -30,7 +30,6 @@ PAGES = {
 MANUAL = "\n".join(PAGES.values())
 BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
 """The lines of all code blocks."""
-PICTURES = sorted(DOCS.glob("manual/*.svg"))
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +172,7 @@ def test_the_box_gets_the_manual(manual: ModuleType):
     assert max(map(len, drawn)) <= 80
 
 
-@pytest.mark.parametrize("path", PICTURES, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted(DOCS.glob("manual/*.svg")), ids=lambda p: p.name)
 def test_pictures_stand_alone(path: Path):
     """Each has a title and a description, is shown, and asks for nothing outside of it."""
     root = ET.parse(path).getroot()

@@ -9,6 +9,7 @@ import sysconfig
 import tomllib
 import zipfile
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -18,22 +19,6 @@ from tests.factories.paths import ROOT
 CLIENT = ROOT / "appliance" / "plugins" / "client" / "pyproject.toml"
 OWN = ("train.py", "appliance.py", "serial_port.py", "library.py", "tests/__init__.py")
 """Files of a user, in the folder in which the programs run."""
-USES_BOTH = """
-import numpy as np, palpate
-from palpate_train import PalpateClassifier
-x = np.random.default_rng(0).integers(900, 1100, (24, 100, 4, 4)).astype(np.uint16)
-y = np.repeat(["cork", "felt"], 12)
-x[:12, ::4] += 300
-model = PalpateClassifier(rate_hz=100.0, steps=0, size="64").fit(x, y)
-print(palpate.__file__, *sorted(set(map(str, model.predict(x)))))
-"""
-USES_CLIENT = """
-import sys
-from palpate.client import answers, box, feed
-from palpate.core.sentences import sentence
-line = sentence("RES", 1, 0.5, "ok", "cork", 0.9, 0.8, 1, 0, 1.2, "b", "sim", 1.0).decode()
-print(answers.__file__, answers.Answer.read(line).label, feed.DEFAULT, "numpy" in sys.modules)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +88,16 @@ def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
 @pytest.mark.slow
 def test_box_and_desktop_beside_files_of_the_user(wheels: dict[str, Path], tmp_path: Path):
     """A tiny set is fitted without PyTorch's stages, and answered."""
-    told = run([wheels["palpate"], wheels["palpate_train"]], USES_BOTH, tmp_path)
+    uses_both = dedent("""
+    import numpy as np, palpate
+    from palpate_train import PalpateClassifier
+    x = np.random.default_rng(0).integers(900, 1100, (24, 100, 4, 4)).astype(np.uint16)
+    y = np.repeat(["cork", "felt"], 12)
+    x[:12, ::4] += 300
+    model = PalpateClassifier(rate_hz=100.0, steps=0, size="64").fit(x, y)
+    print(palpate.__file__, *sorted(set(map(str, model.predict(x)))))
+    """)
+    told = run([wheels["palpate"], wheels["palpate_train"]], uses_both, tmp_path)
     assert told.startswith(str(tmp_path))
     assert told.endswith("cork felt\n")
 
@@ -128,7 +122,14 @@ def test_the_box_in_a_clean_environment(wheels: dict[str, Path], tmp_path: Path)
 @pytest.mark.slow
 def test_the_client_alone(wheels: dict[str, Path], tmp_path: Path):
     """Its wheel suffices, and loads no numpy."""
-    told = run([wheels["palpate_client"]], USES_CLIENT, tmp_path)
+    uses_client = dedent("""
+    import sys
+    from palpate.client import answers, box, feed
+    from palpate.core.sentences import sentence
+    line = sentence("RES", 1, 0.5, "ok", "cork", 0.9, 0.8, 1, 0, 1.2, "b", "sim", 1.0).decode()
+    print(answers.__file__, answers.Answer.read(line).label, feed.DEFAULT, "numpy" in sys.modules)
+    """)
+    told = run([wheels["palpate_client"]], uses_client, tmp_path)
     assert told.startswith(str(tmp_path))
     assert told.endswith("cork /run/palpate/feed.sock False\n")
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from textwrap import dedent
 from typing import Any
 
 import numpy as np
@@ -121,40 +122,38 @@ def test_counters_wrap() -> None:
         assert (reader.sensor.counters.stale_frames, reader.sensor.counters.enumerations) == (0, 1)
 
 
-ALLOCATES = """
-import sys
-sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
-import pico_shell, settings, micropython, gc
-sys.modules["machine"] = machine = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
-sys.modules["time"] = clock = pico_shell.PicoTicks(0)
-machine.Pin.__call__ = lambda self, level: None  # the doubles may allocate nothing either
-machine.ADC.read_u16 = lambda self: 0x1234
-import main
-{change}
-made = main.board(settings)
-made.running = True  # as START makes it, without the thread
-now = 0
-clock.ticks_us = lambda: now
-def frames(n):
-    global now
-    for i in range(n):
-        now += 1333 if i % 50 else 9000
-        micropython.heap_lock()
-        made.tick()
-        micropython.heap_unlock()
-frames(3000)
-print("nothing", made._fifo._overflowed)
-"""
-
-
-def allocating(change: str) -> subprocess.CompletedProcess[str]:
-    """Ticks with the heap locked, after a change of the settings."""
-    return pico.run("-c", ALLOCATES.format(folder=str(pico.SHELL.parent), change=change))
-
-
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_an_interrupt_allocates_nothing(dtype: str) -> None:
     """3000 frames with gaps and an overflow, with the heap locked; one allocation fails."""
+    allocates = dedent("""
+    import sys
+    sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
+    import pico_shell, settings, micropython, gc
+    sys.modules["machine"] = machine = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
+    sys.modules["time"] = clock = pico_shell.PicoTicks(0)
+    machine.Pin.__call__ = lambda self, level: None  # the doubles may allocate nothing either
+    machine.ADC.read_u16 = lambda self: 0x1234
+    import main
+    {change}
+    made = main.board(settings)
+    made.running = True  # as START makes it, without the thread
+    now = 0
+    clock.ticks_us = lambda: now
+    def frames(n):
+        global now
+        for i in range(n):
+            now += 1333 if i % 50 else 9000
+            micropython.heap_lock()
+            made.tick()
+            micropython.heap_unlock()
+    frames(3000)
+    print("nothing", made._fifo._overflowed)
+    """)
+
+    def allocating(change: str) -> subprocess.CompletedProcess[str]:
+        """Ticks with the heap locked, after a change of the settings."""
+        return pico.run("-c", allocates.format(folder=str(pico.SHELL.parent), change=change))
+
     done = allocating(f"settings.DTYPE = {dtype!r}; settings.FIFO_S = 0.5")
     assert done.stdout == "nothing True\n", done.stderr
     worse = allocating("main.readout.Fifo.filled = lambda self: [0] * 100")
@@ -186,32 +185,30 @@ def test_settings_that_cannot_be(options: dict[str, Any], message: str) -> None:
     assert ended.returncode == 1
 
 
-CTRL_C = """
-import sys
-sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
-import pico_shell, settings
-sys.modules["machine"] = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
-import main
-class Recorded:
-    def kbd_intr(self, char):
-        print("kbd_intr", char)
-served = []
-def serve(board, *streams):
-    print("serving")
-    served.append(board)
-    board.request(3)
-    raise OSError(5)
-main.micropython, main.readout.serve = Recorded(), serve
-try:
-    main.run(settings)
-except OSError:
-    print("still running", served[0].running)
-"""
-
-
 def test_ctrl_c_is_a_byte_while_it_serves() -> None:
     """The number of START must not interrupt it; after an error Ctrl-C works again."""
-    done = pico.run("-c", CTRL_C.format(folder=str(pico.SHELL.parent)))
+    ctrl_c = dedent("""
+    import sys
+    sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too
+    import pico_shell, settings
+    sys.modules["machine"] = pico_shell.PicoMachine(settings, pico_shell.OPTIONS)
+    import main
+    class Recorded:
+        def kbd_intr(self, char):
+            print("kbd_intr", char)
+    served = []
+    def serve(board, *streams):
+        print("serving")
+        served.append(board)
+        board.request(3)
+        raise OSError(5)
+    main.micropython, main.readout.serve = Recorded(), serve
+    try:
+        main.run(settings)
+    except OSError:
+        print("still running", served[0].running)
+    """)
+    done = pico.run("-c", ctrl_c.format(folder=str(pico.SHELL.parent)))
     assert done.stdout.splitlines() == [
         "kbd_intr -1",
         "serving",

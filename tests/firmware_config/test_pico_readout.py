@@ -159,22 +159,22 @@ def test_packets_are_those_of_the_protocol(dtype, level):
 @pytest.mark.parametrize("rows", range(1, 17))
 def test_every_taxel_is_read_once_at_its_place(rows):
     """The select lines stand at its row and column when it is read, and end low."""
+
+    def check_order(rows, cols):
+        """The order in which the taxels of a skin are read."""
+        at, seen, order = 0, [], readout.reading_order(rows, cols)
+        for line, level, taxel in zip(*order, strict=True):
+            at = at & ~(1 << line) | level << line
+            if taxel != readout.NO_TAXEL:
+                assert divmod(taxel, cols) == (at & 15, at >> 4), (rows, cols)
+                seen.append(taxel)
+        assert sorted(seen) == list(range(rows * cols)), (rows, cols)
+        assert at == 0, (rows, cols)
+        if {rows, cols} <= {2, 4, 8, 16}:
+            assert len(order[0]) <= rows * cols + 2, (rows, cols)
+
     for cols in range(1, 17):
         check_order(rows, cols)
-
-
-def check_order(rows, cols):
-    """The order in which the taxels of a skin are read."""
-    at, seen, order = 0, [], readout.reading_order(rows, cols)
-    for line, level, taxel in zip(*order, strict=True):
-        at = at & ~(1 << line) | level << line
-        if taxel != readout.NO_TAXEL:
-            assert divmod(taxel, cols) == (at & 15, at >> 4), (rows, cols)
-            seen.append(taxel)
-    assert sorted(seen) == list(range(rows * cols)), (rows, cols)
-    assert at == 0, (rows, cols)
-    if {rows, cols} <= {2, 4, 8, 16}:
-        assert len(order[0]) <= rows * cols + 2, (rows, cols)
 
 
 def test_numbers_and_times_follow_one_another():
@@ -287,38 +287,38 @@ def test_other_bytes_are_left_alone():
     assert made.sent() == b""
 
 
-class SlowPort:
-    """A port that accepts a few bytes at a time, or none, and gives requests at set turns."""
-
-    def __init__(self, made, requests, chunks):
-        self.made, self.requests, self.chunks = made, dict(requests), itertools.cycle(chunks)
-        self.turn, self.taken = 0, b""
-
-    def readable(self, ms):
-        """Time passes with each look."""
-        assert ms in (0, 1)
-        self.turn += 1
-        if self.made.board.running:
-            self.made.tick()
-        return self.turn in self.requests or self.turn > 400
-
-    def readinto(self, buffer):
-        """The request of this turn."""
-        if self.turn > 400:
-            return 0
-        buffer[0] = self.requests.pop(self.turn)
-        return 1
-
-    def write(self, buffer, at, length):
-        """Accepts a random part."""
-        n = min(next(self.chunks), length)
-        self.taken += bytes(buffer[at : at + n])
-        return n or None
-
-
 @pytest.mark.parametrize("chunks", [(1000,), (7,), (64, 0, 0, 3)])
 def test_replies_wait_for_the_end_of_a_packet(chunks):
     """However few bytes the port takes at a time, no request tears a packet apart."""
+
+    class SlowPort:
+        """A port that accepts a few bytes at a time, or none, and gives requests at set turns."""
+
+        def __init__(self, made, requests, chunks):
+            self.made, self.requests, self.chunks = made, dict(requests), itertools.cycle(chunks)
+            self.turn, self.taken = 0, b""
+
+        def readable(self, ms):
+            """Time passes with each look."""
+            assert ms in (0, 1)
+            self.turn += 1
+            if self.made.board.running:
+                self.made.tick()
+            return self.turn in self.requests or self.turn > 400
+
+        def readinto(self, buffer):
+            """The request of this turn."""
+            if self.turn > 400:
+                return 0
+            buffer[0] = self.requests.pop(self.turn)
+            return 1
+
+        def write(self, buffer, at, length):
+            """Accepts a random part."""
+            n = min(next(self.chunks), length)
+            self.taken += bytes(buffer[at : at + n])
+            return n or None
+
     made = DrivenBoard()
     asked = {
         2: readout.START,

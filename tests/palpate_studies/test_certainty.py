@@ -105,12 +105,10 @@ def test_early_needs_half_the_sweep_where_that_suffices(figures):
     assert early["always"][0]["accuracy"] < early["always"][5]["accuracy"]
 
 
-ABOUT = dict.fromkeys(uncertainty_report.ORIGIN, "x")
-"""What the page says of a run."""
-
-
 def test_of_two_materials_none_is_left_out():
     """The page has calibration and early answers, and nothing of left-out materials."""
+    # What the page says of a run
+    about = dict.fromkeys(uncertainty_report.ORIGIN, "x")
     one = case()
     two, test, also = one.seen_labels < 2, one.labels < 2, one.copied_labels < 2
     of_parts = {
@@ -126,7 +124,7 @@ def test_of_two_materials_none_is_left_out():
     fewer = replace(one, seen_groups=one.seen_groups[:, two], copied_source=source, **of_parts)
     figures = certainty.figures([fewer], NAMES[:2])
     assert set(figures) == {"calibration", "early"}
-    html, pictures = uncertainty_report.render(figures | ABOUT)
+    html, pictures = uncertainty_report.render(figures | about)
     assert set(pictures) == {"reliability"}
     assert "never trained<" not in html
 

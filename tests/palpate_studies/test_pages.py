@@ -19,8 +19,6 @@ from tests.rig import soak
 
 DOCS = ROOT / "docs"
 HTML = tuple(f"{name}/index.html" for name in pages.PAGES)
-SVG = sorted(DOCS.rglob("*.svg"))
-MARKDOWN = [*ROOT.glob("*.md"), *sorted(DOCS.rglob("*.md"))]
 METHODS = {"method", "methods", "shipped"}
 """Keys of results about methods, which depend on the default method."""
 
@@ -78,16 +76,16 @@ def test_a_page_links_to_its_results_and_an_unknown_one_is_an_error(tmp_path: Pa
     assert "stress.json" in PageReader(page.read_text()).links
 
 
-def about_a_default(figures: Any) -> bool:
-    """Whether figures are about methods or a bundle, at any depth."""
-    if isinstance(figures, dict):
-        keys = METHODS & figures.keys() or "bundle" in figures
-        return bool(keys) or any(map(about_a_default, figures.values()))
-    return isinstance(figures, list) and any(map(about_a_default, figures))
-
-
 def test_every_result_about_a_default_is_listed():
     """Nobody would notice that a result outside of the list of `reports` is stale."""
+
+    def about_a_default(figures: Any) -> bool:
+        """Whether figures are about methods or a bundle, at any depth."""
+        if isinstance(figures, dict):
+            keys = METHODS & figures.keys() or "bundle" in figures
+            return bool(keys) or any(map(about_a_default, figures.values()))
+        return isinstance(figures, list) and any(map(about_a_default, figures))
+
     assert list(DOCS.rglob("*.html")) == []
     found = [one for one in DOCS.rglob("*.json") if about_a_default(json.loads(one.read_bytes()))]
     listed = {DOCS / report.file for report in reports.REPORTS}
@@ -95,17 +93,16 @@ def test_every_result_about_a_default_is_listed():
     assert all(provenance.read(path).commit for path in listed)
 
 
-PACKAGED = re.compile(
-    r"box ships (?:now, )?bundle (?P<ships>[0-9a-f]{8})|default \d+, (?P<shown>[0-9a-f]{8})"
-    r"|(?P<listed>[0-9a-f]{8})  default \d"
-)
-
-
 def test_no_document_shows_another_bundle_as_the_packaged_one_or_a_brace():
     """Examples come from today's bundle."""
-    texts = {name(path): path.read_text("utf-8") for path in MARKDOWN}
+    packaged = re.compile(
+        r"box ships (?:now, )?bundle (?P<ships>[0-9a-f]{8})|default \d+, (?P<shown>[0-9a-f]{8})"
+        r"|(?P<listed>[0-9a-f]{8})  default \d"
+    )
+    markdown = [*ROOT.glob("*.md"), *sorted(DOCS.rglob("*.md"))]
+    texts = {name(path): path.read_text("utf-8") for path in markdown}
     for page, text in texts.items():
-        found = {found[found.lastgroup or 0] for found in PACKAGED.finditer(text)}
+        found = {found[found.lastgroup or 0] for found in packaged.finditer(text)}
         assert found <= {score.shipped()}, page
         plain = re.sub(r"(?ms)^```.*?^```|^ {4}.*?$|`[^`]*`|<!--.*?-->", "", text)
         assert re.findall(r"\{[a-z_]*\}", plain) == [], page
@@ -141,7 +138,7 @@ def test_a_page_can_be_read(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", rendered.SCHEMES)
-@pytest.mark.parametrize("path", SVG, ids=name)
+@pytest.mark.parametrize("path", sorted(DOCS.rglob("*.svg")), ids=name)
 def test_a_picture_can_be_read(browser: Any, path: Path, scheme: str):
     """The picture alone, as Markdown shows it, light or dark as its reader has chosen."""
     assert rendered.faults(browser, rendered.address(path), 1024, scheme) == {}

@@ -18,8 +18,6 @@ from palpate_train.evaluate.evaluate import Where
 from palpate_train.models import methods
 from palpate_train.models.methods import Method, model_inputs
 
-BY_NAME = {one.name: one for one in corruptions.CORRUPTIONS}
-
 
 def small(kind: str = "int16", shape: tuple[int, ...] = (12, 120, 3, 3)) -> Dataset:
     """Sweeps of two materials; the second is stronger and rougher."""
@@ -62,16 +60,12 @@ def learn(sweeps: Dataset, given: np.ndarray, seed: int, broken: int = 0) -> Nea
     return NearestMean(np.stack([seen[sweeps.labels == k].mean(axis=0) for k in (0, 1)]), broken)
 
 
-def learn_broken(sweeps: Dataset, given: np.ndarray, seed: int) -> NearestMean:
-    """Train a fake with three answers that are not finite."""
-    return learn(sweeps, given, seed, 3)
-
-
 FAKE = Method("fake", "two figures, nearest mean", "raw", learn)
 
 
 def test_one_task_travels_and_counts():
     """A task and its result survive a conversion; the numbers are those counted by hand."""
+    by_name = {one.name: one for one in corruptions.CORRUPTIONS}
     sweeps, trial = small(), EvaluationSweeps(small())
     sent = pickle.loads(pickle.dumps((FAKE, sweeps, trial, 0)))
     done = stress.evaluate_method(*sent)
@@ -79,13 +73,18 @@ def test_one_task_travels_and_counts():
     assert list(done["curves"]) == [one.name for one in corruptions.applicable(trial)]
     assert list(done["pairs"]) == [one.name for one in stress.pairs()]
     assert done["curves"]["gain-up"]["right"][0] == 12
-    up = BY_NAME["gain-up"].apply(trial, 0.5, 0)
+    up = by_name["gain-up"].apply(trial, 0.5, 0)
     right = int((learn(sweeps, sweeps.samples, 0).logits(up).argmax(1) == sweeps.labels).sum())
     assert done["curves"]["gain-up"]["right"][-1] == right < 12
 
 
 def test_what_is_not_finite_is_wrong_and_refusals_are_said():
     """A set of another kind is the caller's error; a refused set is a result."""
+
+    def learn_broken(sweeps: Dataset, given: np.ndarray, seed: int) -> NearestMean:
+        """Train a fake with three answers that are not finite."""
+        return learn(sweeps, given, seed, 3)
+
     done = stress.evaluate_method(
         replace(FAKE, train=learn_broken), small(), EvaluationSweeps(small()), 0
     )

@@ -16,8 +16,6 @@ from tests.factories.paths import ROOT
 from tests.factories.study_pages import committed
 
 DOCUMENTS = sorted({document for document, *_ in tables.TABLES})
-MARKS = re.compile(r"(?s)<!--.*?-->")
-MARKED = re.compile(r"<!-- (?!provenance|/)([a-z -]+) -->\n")
 
 
 @pytest.fixture
@@ -35,6 +33,8 @@ def test_every_table_is_written_once_and_the_text_around_it_stays(
     project: Path, capsys: pytest.CaptureFixture[str]
 ):
     """A second run changes nothing; each marker of a document belongs to a table."""
+    marked = re.compile(r"<!-- (?!provenance|/)([a-z -]+) -->\n")
+    marks = re.compile(r"(?s)<!--.*?-->")
     outside = {
         name: re.split(r"(?s)<!--.*?-->", (project / name).read_text()) for name in DOCUMENTS
     }
@@ -45,8 +45,8 @@ def test_every_table_is_written_once_and_the_text_around_it_stays(
     assert capsys.readouterr().out == ""
     for name in DOCUMENTS:
         known = {marker for document, marker, *_ in tables.TABLES if document == name}
-        assert set(MARKED.findall(first[name])) == known
-        after = re.split(MARKS, first[name])
+        assert set(marked.findall(first[name])) == known
+        after = re.split(marks, first[name])
         assert (outside[name][0], outside[name][-1]) == (after[0], after[-1])
     assert "var(" not in first[tables.FRONT]
 
@@ -105,17 +105,17 @@ def test_answers_add_up_and_older_figures_say_so_first():
     assert "0badbead" in bench_table.table(figures | {"bundle": "0badbead"}).partition("\n")[0]
 
 
-def result(method: str, protocol: str, right: int, removed: bool = True, **more: Any) -> Any:
-    """A result as evaluate writes it, of a hundred windows and two materials."""
-    ends = [right / 100 - 0.02, right / 100 + 0.02]
-    return {
-        **{"method": method, "protocol": protocol, "means_removed": removed, "seed": 1},
-        **{"materials": ["a"] * 2, "window": {"right": right, "total": 100}, "interval": ends},
-    } | more
-
-
 def test_each_test_says_whether_ours_is_ahead():
     """Tests without means come first, then tests with more classes; seeds are averaged."""
+
+    def result(method: str, protocol: str, right: int, removed: bool = True, **more: Any) -> Any:
+        """A result as evaluate writes it, of a hundred windows and two materials."""
+        ends = [right / 100 - 0.02, right / 100 + 0.02]
+        return {
+            **{"method": method, "protocol": protocol, "means_removed": removed, "seed": 1},
+            **{"materials": ["a"] * 2, "window": {"right": right, "total": 100}, "interval": ends},
+        } | more
+
     seven: dict[str, Any] = {"materials": ["a"] * 7}
     results = [
         result("palpate", "leave:force", 95, removed=False),

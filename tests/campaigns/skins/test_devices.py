@@ -10,9 +10,9 @@ from palpate.core import config, sweep_file, types
 from palpate.core.types import Status
 from palpate.io import skins
 from palpate.sim import rig, script
+from tests.campaigns.skins.command import main
 from tests.factories.paths import NO_SITE
 from tests.factories.skins import devices, sweeps
-from tests.factories.skins.command import main
 from tests.factories.skins.wires import WIRES
 
 SEED, SWEEPS = 3, 2

@@ -25,7 +25,7 @@ LIMIT_S = 600
 
 def box(*arguments: object) -> str:
     """Run `palpate ARGUMENTS`; returns its output."""
-    return _command("tests.factories.skins.command", *arguments)
+    return _command("tests.campaigns.skins.command", *arguments)
 
 
 def desktop(*arguments: object) -> str:

@@ -89,15 +89,17 @@ def test_views_follow_the_touches(model):
     assert [v.number for v in seen] == list(range(1, len(seen) + 1))
 
 
-def pressed(*loads: float) -> devices.SimDevices:
-    """A skin with these loads on all taxels except the last, for a second each."""
-    on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
-    on[:, 3, 3] = 3
-    return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
-
-
 def test_a_finger_is_noticed_above_any_unloaded_skin(model):
     """Above the bundle's counts; one that lay there at the start, once each taxel was free."""
+
+    def pressed(*loads: float) -> devices.SimDevices:
+        """A skin with these loads on all taxels except the last, for a second each."""
+        on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
+        on[:, 3, 3] = 3
+        return devices.build(
+            skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim"
+        )
+
     rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
     seen = views_of(pressed(130, 145, 52, 130), rest)(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
@@ -111,14 +113,14 @@ def test_a_finger_is_noticed_above_any_unloaded_skin(model):
     assert seen[-1].load[3][3] == 0
 
 
-def known(model: Bundle, **changes: object) -> Expected:
-    """The skin as a bundle with another manifest describes it."""
-    return Expected.by(replace(model, manifest=replace(model.manifest, **changes)))
-
-
 @pytest.mark.parametrize("lacks", ["a threshold", "positions", "a bundle"])
 def test_without_trained_positions_the_centre_alone_is_shown(model, lacks):
     """The threshold is that of the present skin; the centre is in taxels."""
+
+    def known(model: Bundle, **changes: object) -> Expected:
+        """The skin as a bundle with another manifest describes it."""
+        return Expected.by(replace(model, manifest=replace(model.manifest, **changes)))
+
     bare = {"contact": None, "displacement": None}
     limits = replace(model.manifest.thresholds, contact=None)
     expected, hint = {

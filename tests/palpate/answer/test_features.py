@@ -30,6 +30,23 @@ def _sweep(frames: int = FRAMES, rows: int = 2, cols: int = 3, seed: int = 1) ->
 
 def test_weights_and_h_features_are_equations_4_and_5():
     """Sums over sums, 1 / M without activation; all 760 H-features by the paper's sum."""
+
+    def h_by_the_formula(x: np.ndarray) -> np.ndarray:
+        """Eq. 5 for 1500 frames at 750 Hz, in whole 1/1500 s, so that no edge hangs on rounding."""
+        n = np.arange(FRAMES)
+        weights = x.reshape(FRAMES, -1).mean(axis=0) / x.reshape(FRAMES, -1).mean(axis=0).sum()
+        p = np.zeros((40, 19))
+        for window in range(40):
+            inside = (2 * n >= 75 * window) & (2 * n < 75 * window + 150)
+            for m, s in enumerate(x.reshape(FRAMES, -1).T.astype(float)):
+                less_mean = s[inside] - s[inside].mean()
+                for k in range(1, 38):
+                    turn = np.exp(-2j * np.pi * 10 * k * n[inside] / RATE)
+                    p[window, k // 2] += (
+                        weights[m] * abs(np.sum(turn * less_mean) / math.sqrt(FRAMES)) ** 2
+                    )
+        return p / p.sum(axis=1, keepdims=True)
+
     x = _sweep()
     sums = x.sum(axis=0, dtype=float).ravel()
     np.testing.assert_allclose(features.taxel_weights(x), sums / sums.sum(), rtol=1e-12)
@@ -41,7 +58,7 @@ def test_weights_and_h_features_are_equations_4_and_5():
     x = _sweep()
     assert features.h_shape(FRAMES, RATE) == (40, 19)
     np.testing.assert_allclose(
-        features.h_features(x, RATE).reshape(40, 19), _h_by_the_formula(x), atol=1e-12
+        features.h_features(x, RATE).reshape(40, 19), h_by_the_formula(x), atol=1e-12
     )
 
 
@@ -82,23 +99,6 @@ def test_l_features_are_equations_1_to_3(x, rate_hz, first, split):
         centroids = (power[:, band] @ hz[band]) / power[:, band].sum(axis=1)
         want.append(float(features.taxel_weights(x) @ centroids))
     np.testing.assert_allclose(features.l_features(x, rate_hz), want, rtol=1e-9)
-
-
-def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
-    """Eq. 5 for 1500 frames at 750 Hz, in whole 1/1500 s, so that no edge hangs on rounding."""
-    n = np.arange(FRAMES)
-    weights = x.reshape(FRAMES, -1).mean(axis=0) / x.reshape(FRAMES, -1).mean(axis=0).sum()
-    p = np.zeros((40, 19))
-    for window in range(40):
-        inside = (2 * n >= 75 * window) & (2 * n < 75 * window + 150)
-        for m, s in enumerate(x.reshape(FRAMES, -1).T.astype(float)):
-            less_mean = s[inside] - s[inside].mean()
-            for k in range(1, 38):
-                turn = np.exp(-2j * np.pi * 10 * k * n[inside] / RATE)
-                p[window, k // 2] += (
-                    weights[m] * abs(np.sum(turn * less_mean) / math.sqrt(FRAMES)) ** 2
-                )
-    return p / p.sum(axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize(("window", "scipys"), [("rect", "boxcar"), ("hann", "hann")])

@@ -28,7 +28,6 @@ A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 S = 1_000_000_000
 ANOTHER = "another object: "
 DELIVERED = ClassifierConfig()
-PAUSED = replace(UNTIL_NEW_OBJECT, object_s=60.0)
 
 
 def classifier(bundle: Bundle, settings: ClassifierConfig = DELIVERED, **more: Any) -> Classifier:
@@ -83,11 +82,12 @@ def test_a_bayes_factor_of_ten_contradicts(labels):
 
 def test_a_pause_is_from_the_end_to_the_start():
     """More than object_s ends an object; 0 never does. A sweep before the end is not a pause."""
+    paused = replace(UNTIL_NEW_OBJECT, object_s=60.0)
     before = FusedSweeps(1, (np.ones(2) / 2,), 1, 100 * S)
-    assert not before.ended(160 * S, PAUSED)
-    assert before.ended(160 * S + 1, PAUSED)
+    assert not before.ended(160 * S, paused)
+    assert before.ended(160 * S + 1, paused)
     assert not before.ended(10**6 * S, UNTIL_NEW_OBJECT)
-    assert not before.ended(0, PAUSED)
+    assert not before.ended(0, paused)
 
 
 def test_a_contradiction_begins_another_object(toy):
@@ -178,28 +178,11 @@ def test_enrolled_labels_contradict(tmp_path):
     assert given[1] == ("ok", "c", 1, f"{ANOTHER}c after a")
 
 
-def drawn(materials: Iterable[int], seed: int) -> list[tuple[str, Sweep]]:
-    """A sweep of each material (an index into MATERIALS) with its name; attached anew every 30."""
-    rng = np.random.default_rng(seed)
-    places = skin.placements("T-REAL", seed)
-    found = []
-    for i, k in enumerate(materials):
-        name, place = skin.MATERIALS[k], places[i // 30 % len(places)]
-        window = skin.window(name, place, rng, skin.LEVEL_BLIND)
-        found.append((name, toy_bundle.sweep_of(window)))
-    return found
-
-
 def in_runs(seed: int) -> Iterable[int]:
     """Materials in random order, 2 to 4 sweeps of each."""
     rng = np.random.default_rng(seed)
     while True:
         yield from [int(rng.integers(6))] * int(rng.integers(2, 5))
-
-
-def named(it: Classifier, sweeps: Iterable[Sweep]) -> list[str]:
-    """The label of each answer, "" unless its status is ok."""
-    return [v.label if v.status is Status.OK else "" for v in map(it, sweeps)]
 
 
 ORDERS = {
@@ -213,6 +196,22 @@ ORDERS = {
 @pytest.mark.parametrize("order", ORDERS)
 def test_new_object_forgotten(default_bundle, order):
     """240 sweeps of six materials after one NEW OBJECT: 1 % wrong at most; fused over half."""
+
+    def named(it: Classifier, sweeps: Iterable[Sweep]) -> list[str]:
+        """The label of each answer, "" unless its status is ok."""
+        return [v.label if v.status is Status.OK else "" for v in map(it, sweeps)]
+
+    def drawn(materials: Iterable[int], seed: int) -> list[tuple[str, Sweep]]:
+        """A sweep of each material (index into MATERIALS) with its name; attached anew every 30."""
+        rng = np.random.default_rng(seed)
+        places = skin.placements("T-REAL", seed)
+        found = []
+        for i, k in enumerate(materials):
+            name, place = skin.MATERIALS[k], places[i // 30 % len(places)]
+            window = skin.window(name, place, rng, skin.LEVEL_BLIND)
+            found.append((name, toy_bundle.sweep_of(window)))
+        return found
+
     truth, sweeps = zip(*drawn(ORDERS[order](), 41), strict=True)
     alone = named(classifier(default_bundle), sweeps)
 

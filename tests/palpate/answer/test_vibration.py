@@ -12,14 +12,14 @@ from palpate.answer.slide import SlideLimits, vibration
 TARE = np.full((2, 2), 20.0)
 
 
-def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
-    """Counts [T, 2, 2] that swing by each of `sizes` around the load in one part after another."""
-    swing = np.concatenate([size * (-1.0) ** np.arange(each) for size in sizes])
-    return (TARE + load + swing[:, None, None]).astype(np.float32)
-
-
 def test_it_is_the_deviation_over_the_load_and_a_constant_part_rests():
     """Whatever gain and shear; NaN is refused elsewhere."""
+
+    def window(*sizes: float, load: float = 50.0, each: int = 40) -> np.ndarray:
+        """Counts [T, 2, 2] that swing by each of `sizes` around the load, a part each."""
+        swing = np.concatenate([size * (-1.0) ** np.arange(each) for size in sizes])
+        return (TARE + load + swing[:, None, None]).astype(np.float32)
+
     want = [math.log(1 / 50), math.log(4 / 50)]
     assert vibration(window(1, 4), TARE, 2) == pytest.approx(want, abs=1e-3)
     strong = TARE + 10 * (window(1, 4) - TARE)

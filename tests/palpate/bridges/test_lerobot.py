@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import numpy as np
@@ -117,24 +118,24 @@ def test_three_axes_have_colours(plugin):
 
 def test_a_restarted_box_is_read_again(camera):
     """Nothing of the program before stays, and a skin that does not stream gives its reason."""
+
+    def is_old(camera: Any) -> bool:
+        try:
+            camera.read_latest(20)
+        except TimeoutError as e:
+            return "ms old; " in str(e)
+        return False
+
     taken(camera, feed_lines.verdict(1, 2.5))
     camera.feed.say(feed_lines.hello(pid=72), feed_lines.state("no-device", "the skin is off"))
     eventually(lambda: camera.observation()["verdict_code"] == 0)
     assert camera.observation()["taxel_2_2"] == 0
     with pytest.raises(TimeoutError, match="skin"):
         camera.async_read(50)
-    eventually(lambda: _old(camera))
+    eventually(lambda: is_old(camera))
     camera.feed.say({"type": "frame", "taxels": "?"})
     with pytest.raises(TimeoutError, match="line"):
         camera.async_read(300)
-
-
-def _old(camera: Any) -> bool:
-    try:
-        camera.read_latest(20)
-    except TimeoutError as e:
-        return "ms old; " in str(e)
-    return False
 
 
 def test_what_cannot_be_read_is_refused(plugin, tmp_path, monkeypatch):
@@ -164,44 +165,42 @@ def test_what_cannot_be_read_is_refused(plugin, tmp_path, monkeypatch):
     assert plugin.PalpateCamera.find_cameras() == []
 
 
-IN_LEROBOT = """
-import json, sys
-import draccus
-from dataclasses import dataclass, field
-from lerobot.cameras import CameraConfig
-from lerobot.cameras.utils import make_cameras_from_configs
-from lerobot.datasets.utils import hw_to_dataset_features
-from lerobot.utils.import_utils import register_third_party_plugins
-
-register_third_party_plugins()
-
-@dataclass
-class Robot:
-    cameras: dict[str, CameraConfig] = field(default_factory=dict)
-
-words = '{skin: {type: palpate, fps: 10, width: 64, height: 80, feed: "%s"}}' % sys.argv[1]
-robot = draccus.parse(Robot, args=[f"--cameras={words}"])
-(camera,) = make_cameras_from_configs(robot.cameras).values()
-with camera:
-    image, observation = camera.read(), camera.observation()
-    latest = camera.read_latest()
-state = {name: type(value) for name, value in observation.items()}
-features = hw_to_dataset_features(state | {"skin": latest.shape}, "observation")
-print(json.dumps({
-    "type": robot.cameras["skin"].type,
-    "shape": image.shape,
-    "code": observation["verdict_code"],
-    "features": {name: [one["dtype"], list(one["shape"])] for name, one in features.items()},
-}))
-"""
-
-
 @pytest.mark.slow
 def test_lerobot_itself_finds_and_reads_it(tmp_path):
     """By its distribution's prefix and a command line; observations become features."""
+    in_lerobot = dedent("""
+    import json, sys
+    import draccus
+    from dataclasses import dataclass, field
+    from lerobot.cameras import CameraConfig
+    from lerobot.cameras.utils import make_cameras_from_configs
+    from lerobot.datasets.utils import hw_to_dataset_features
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+
+    @dataclass
+    class Robot:
+        cameras: dict[str, CameraConfig] = field(default_factory=dict)
+
+    words = '{skin: {type: palpate, fps: 10, width: 64, height: 80, feed: "%s"}}' % sys.argv[1]
+    robot = draccus.parse(Robot, args=[f"--cameras={words}"])
+    (camera,) = make_cameras_from_configs(robot.cameras).values()
+    with camera:
+        image, observation = camera.read(), camera.observation()
+        latest = camera.read_latest()
+    state = {name: type(value) for name, value in observation.items()}
+    features = hw_to_dataset_features(state | {"skin": latest.shape}, "observation")
+    print(json.dumps({
+        "type": robot.cameras["skin"].type,
+        "shape": image.shape,
+        "code": observation["verdict_code"],
+        "features": {name: [one["dtype"], list(one["shape"])] for name, one in features.items()},
+    }))
+    """)
     lerobot.required()
     with lerobot.played(tmp_path / "feed") as feed, saying(feed, PRESSED):
-        found = lerobot.run(IN_LEROBOT, tmp_path / "feed")
+        found = lerobot.run(in_lerobot, tmp_path / "feed")
     assert found == {
         "type": "palpate",
         "shape": [80, 64, 3],

@@ -101,21 +101,19 @@ def test_another_client_reads_the_map(box, raw, address):
 MEASURED_AT = 42
 
 
-MEASURED = (
-    ((), [0, 0]),
-    ((1,), [0, 0]),
-    (("", "30.5", "rows+"), [305, 1]),
-    ((1, "8.0", "rows-"), [80, 2]),
-    (("", "400.0", "cols+"), [4000, 3]),
-    (("", "9999.9", "cols-"), [65535, 4]),
-    (("", "30.5", "sideways"), [305, 0]),
-)
-"""The optional fields of an answer, and the two registers."""
-
-
 def test_the_measured_slide_is_read_and_zero_before(box, raw):
     """Tenths of mm/s and a code, not writable; before anything was heard all are zero."""
-    for number, (optional, words) in enumerate(MEASURED, 1):
+    # The optional fields of an answer, and the two registers
+    measured = (
+        ((), [0, 0]),
+        ((1,), [0, 0]),
+        (("", "30.5", "rows+"), [305, 1]),
+        ((1, "8.0", "rows-"), [80, 2]),
+        (("", "400.0", "cols+"), [4000, 3]),
+        (("", "9999.9", "cols-"), [65535, 4]),
+        (("", "30.5", "sideways"), [305, 0]),
+    )
+    for number, (optional, words) in enumerate(measured, 1):
         box.say(result(number, optional=optional))
         eventually(lambda number=number: word(raw, "answers") == number)
         assert raw.registers(MEASURED_AT, 2) == words, optional
@@ -125,17 +123,15 @@ def test_the_measured_slide_is_read_and_zero_before(box, raw):
     assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
 
 
-FINGERS_AT = 44
-
-
 def test_the_fingers_are_read(box, raw):
     """Name, status, code and probability of each; 0 without, also after one skin's answer."""
+    fingers_at = 44
     box.say(finger("left", 1, "ok", "paper"))
     box.say(finger("right", 1, "no-contact", "", "0.000"))
     box.say(result(1, label="paper"))
     eventually(lambda: word(raw, "answers") == 1)
     eventually(lambda: word(raw, "label code") == 2)
-    found = raw.registers(FINGERS_AT, 1 + 4 * 7)
+    found = raw.registers(fingers_at, 1 + 4 * 7)
     assert found[0] == 2
     assert b"".join(w.to_bytes(2, "big") for w in found[1:5]) == b"left\0\0\0\0"
     assert found[5:8] == [STATUS_CODES[Status.OK], 2, 900]
@@ -144,7 +140,7 @@ def test_the_fingers_are_read(box, raw):
     assert found[15:] == [0] * 14
     box.say(result(2))
     eventually(lambda: word(raw, "answers") == 2)
-    assert raw.registers(FINGERS_AT, 1 + 4 * 7) == [0] * 29
+    assert raw.registers(fingers_at, 1 + 4 * 7) == [0] * 29
 
 
 def test_another_client_sweeps(box, raw, address):
@@ -266,14 +262,14 @@ def test_another_bundle_brings_its_labels(box, raw):
     assert word(raw, "label code") == 1
 
 
-def flood(peer: socket.socket) -> None:
-    """Send requests without end, and read no reply."""
-    while True:
-        peer.sendall((struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000020")) * 1000)
-
-
 def test_hostile_bytes_reach_nobody_else(raw, address):
     """Noise, wrong headers, endless, half or unread bytes cost their own connection."""
+
+    def flood(peer: socket.socket) -> None:
+        """Send requests without end, and read no reply."""
+        while True:
+            peer.sendall((struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000020")) * 1000)
+
     generator = random.Random(1)
     for data in [
         *(generator.randbytes(generator.randrange(1, 400)) for _ in range(100)),
@@ -372,16 +368,16 @@ def test_every_pdu_is_parsed_or_refused(pdu):
     assert 1 <= count <= modbus_pdu.MOST_BITS
 
 
-def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
-    """A view of a box that streams."""
-    said = BoxState.of(read(speaking_box.state()).fields)
-    view = noted(BoxView(labels=LABELS), said, 1)
-    return noted(view, answer, 1) if answer else view
-
-
 @pytest.mark.parametrize("status", list(Status))
 def test_each_status_has_its_code(status):
     """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone."""
+
+    def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
+        """A view of a box that streams."""
+        said = BoxState.of(read(speaking_box.state()).fields)
+        view = noted(BoxView(labels=LABELS), said, 1)
+        return noted(view, answer, 1) if answer else view
+
     label = "paper" if status.classified else ""
     words = registers(viewed(Answer(1, 1.0, status, label, 0.9, 0.8, 1, 0, 1e9)), alive=True)
     assert words[ADDRESSES["status"]] == [*Status].index(status) + 1

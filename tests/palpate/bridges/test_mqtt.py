@@ -286,6 +286,19 @@ def other_broker(box: SpeakingBox, silent_s: float) -> Iterator[socket.socket]:
 
 def test_a_broker_that_takes_few_messages_at_a_time(box):
     """No more are under way than it allows; it would end the connection."""
+
+    def published(sent: bytes) -> int:
+        """The number of PUBLISH packets."""
+        found = at = 0
+        while at < len(sent):
+            size, shift, found, at = 0, 0, found + (sent[at] >> 4 == 3), at + 1
+            while True:
+                size, shift, at = size | (sent[at] & 127) << shift, shift + 7, at + 1
+                if not sent[at - 1] & 128:
+                    break
+            at += size
+        return found
+
     with other_broker(box, 0.5) as line:
         for number in range(20):
             box.say(state(), result(number))
@@ -319,19 +332,6 @@ def test_two_boxes_of_one_name(server, box, caplog, tmp_path):
     with bridge("mqtt", *options(server, box)), bridge("mqtt", *other):
         eventually(lambda: "another box may be named b1" in caplog.text)
         assert "trying again" in caplog.text
-
-
-def published(sent: bytes) -> int:
-    """The number of PUBLISH packets."""
-    found = at = 0
-    while at < len(sent):
-        size, shift, found, at = 0, 0, found + (sent[at] >> 4 == 3), at + 1
-        while True:
-            size, shift, at = size | (sent[at] & 127) << shift, shift + 7, at + 1
-            if not sent[at - 1] & 128:
-                break
-        at += size
-    return found
 
 
 @pytest.mark.parametrize("speech", [b"", b"HTTP/1.1 400\r\n\r\n", b"\x20\x03\x00\x00\x00\xff" * 9])

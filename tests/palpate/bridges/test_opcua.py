@@ -86,28 +86,27 @@ def heard(box: SpeakingBox, client: Any) -> None:
     eventually(lambda: box.say(state()) or value(client, path) == "streaming")
 
 
-def quality(client: Any, path: str) -> str:
-    """The name of a variable's status."""
-    return str(node(client, path).read_data_value(raise_on_bad_status=False).StatusCode.name)
-
-
-class Changes:
-    """Keeps the notifications of a subscription."""
-
-    def __init__(self) -> None:
-        self.values: list[Any] = []
-        self.events: list[Any] = []
-
-    def datachange_notification(self, of: Any, found: Any, data: Any) -> None:
-        self.values.append(found)
-
-    def event_notification(self, event: Any) -> None:
-        self.events.append(event)
-
-
 @pytest.mark.slow
 def test_a_result_its_event_and_the_end_of_the_box(box, folder):
     """A result comes whole, and as an event; without the box nothing is good."""
+
+    class Changes:
+        """Keeps the notifications of a subscription."""
+
+        def __init__(self) -> None:
+            self.values: list[Any] = []
+            self.events: list[Any] = []
+
+        def datachange_notification(self, of: Any, found: Any, data: Any) -> None:
+            self.values.append(found)
+
+        def event_notification(self, event: Any) -> None:
+            self.events.append(event)
+
+    def quality(client: Any, path: str) -> str:
+        """The name of a variable's status."""
+        return str(node(client, path).read_data_value(raise_on_bad_status=False).StatusCode.name)
+
     with served(box, folder, "--anonymous") as url, reader(url) as client:
         eventually(
             lambda: box.say(state()) or value(client, "VisionStateMachine.Skin") == "streaming"

@@ -125,20 +125,20 @@ def urscript(program: str, **functions: Any) -> dict[str, Any]:
     return names
 
 
-def by_socket(address: tuple[str, int]) -> dict[str, Any]:
-    """The program with a socket."""
-    ur = SocketOfUr(address)
-    return urscript(
-        (ROBOTS / "palpate_socket.script").read_text(),
-        socket_open=ur.open,
-        socket_read_string=ur.read,
-        socket_send_line=ur.send_line,
-        socket_close=ur.close,
-    )
-
-
 def test_urscript_by_socket(box):
     """palpate_socket.script against a real bridge: a retry without NEW, each fault by its name."""
+
+    def by_socket(address: tuple[str, int]) -> dict[str, Any]:
+        """The program with a socket."""
+        ur = SocketOfUr(address)
+        return urscript(
+            (ROBOTS / "palpate_socket.script").read_text(),
+            socket_open=ur.open,
+            socket_read_string=ur.read,
+            socket_send_line=ur.send_line,
+            socket_close=ur.close,
+        )
+
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
         box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)

@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -183,21 +184,21 @@ def test_a_late_node_gets_the_state(box, node):
         assert late.last("state")["values"]["skin"] == "streaming"
 
 
-@contextmanager
-def fed(folder: Path) -> Iterator[tuple[socket.socket, RosPeer]]:
-    """The bridge on a feed: the connection that stands for the box, and a node that listens."""
-    path = folder / "feed.sock"
-    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
-        listener.bind(str(path))
-        listener.listen()
-        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
-            connection, _ = listener.accept()
-            with connection:
-                yield connection, node
-
-
 def test_frames_from_the_feed(tmp_path):
     """As images, a channel an axis, little-endian; nan where a skin gave no number."""
+
+    @contextmanager
+    def fed(folder: Path) -> Iterator[tuple[socket.socket, RosPeer]]:
+        """The bridge on a feed: the connection that stands for the box, and a node that listens."""
+        path = folder / "feed.sock"
+        with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
+            listener.bind(str(path))
+            listener.listen()
+            with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
+                connection, _ = listener.accept()
+                with connection:
+                    yield connection, node
+
     form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
     hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1", "format": form}
     frame = {"type": "frame", "time_ns": 1, "taxels": [[[1, 2, 3]], [[4, None, 6]]]}
@@ -223,23 +224,21 @@ def test_no_box_is_named():
         assert not node.call("configure")["success"]
 
 
-SILENT_END = """
-import threading
-from rclpy.utilities import get_default_context
-from palpate.bridges import ros
-def end():
-    context = get_default_context()
-    # as the signal handler does it: its waking of the executor has passed
-    context._Context__context.shutdown()
-threading.Timer(2, end).start()
-ros.run([])
-"""
-
-
 def test_an_end_that_wakes_nobody_is_seen():
     """rclpy may wake the executor before the context has ended: the node ends anyway."""
+    silent_end = dedent("""
+    import threading
+    from rclpy.utilities import get_default_context
+    from palpate.bridges import ros
+    def end():
+        context = get_default_context()
+        # as the signal handler does it: its waking of the executor has passed
+        context._Context__context.shutdown()
+    threading.Timer(2, end).start()
+    ros.run([])
+    """)
     done = subprocess.run(
-        [ros.PYTHON, "-c", SILENT_END], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False
+        [ros.PYTHON, "-c", silent_end], cwd=ROOT, env=ros.environment(), timeout=LONG_S, check=False
     )
     assert done.returncode == 0
 

@@ -83,8 +83,6 @@ def saying(**lines: bytes) -> Callable[[Sentence], list[bytes]]:
 
 
 EARLY, LONG = result(1, share="0.40"), {"slide_s": LONG_S, "timeout_s": 2 * LONG_S}
-REFUSES = sentence("ANS", "START", "error", "set trigger.mode to serial")
-NOTHING = sentence("ANS", "ABORT", "error", "no sweep is open")
 
 
 class SweepCase(NamedTuple):
@@ -173,9 +171,10 @@ def test_a_sweep_has_its_own_goal_and_answer(swept):
 
 def test_canceled_when_the_answer_came(swept):
     """The answer that came is the answer; before START nothing is begun."""
+    nothing = sentence("ANS", "ABORT", "error", "no sweep is open")
 
     def script(heard: Sentence) -> list[bytes]:
-        return [result(1), NOTHING] if heard.kind == "ABORT" else obeying(heard)
+        return [result(1), nothing] if heard.kind == "ABORT" else obeying(heard)
 
     swept.box.script = script
     swept.at_phase = lambda phase: swept.canceled.set()
@@ -215,7 +214,8 @@ def test_a_box_that_falls_silent(swept, monkeypatch):
 
 def test_a_box_that_refuses_or_is_not_ready(swept, monkeypatch):
     """Its reason is the reason; nothing of another's is aborted."""
-    swept.box.script = lambda s: [REFUSES] if s.kind == "START" else obeying(s)
+    refuses = sentence("ANS", "START", "error", "set trigger.mode to serial")
+    swept.box.script = lambda s: [refuses] if s.kind == "START" else obeying(s)
     with pytest.raises(CommandRefused, match=r"trigger\.mode"):
         swept.run()
     assert swept.has_heard("START")

@@ -51,16 +51,14 @@ def test_the_client_works_through_it(box):
     assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
 
 
-LONG_LABEL = "plastic very rough, black"[:24].replace(",", " ")
-LONGEST = (
-    *(1_234_567, "1234567.123", "displaced", LONG_LABEL, "0.987", "0.981", 12, 1234, "1234.56"),
-    *("9f3c2a1b", "replay", "1.00", "a long detail about taxels that are broken"),
-)
-
-
 def test_the_short_form_fits_a_string_of_80_characters(box):
     """The longest of each kind: status, label, probability."""
-    lines = [sentence("RES", *LONGEST), state(), result(2)]
+    long_label = "plastic very rough, black"[:24].replace(",", " ")
+    longest = (
+        *(1_234_567, "1234567.123", "displaced", long_label, "0.987", "0.981", 12, 1234, "1234.56"),
+        *("9f3c2a1b", "replay", "1.00", "a long detail about taxels that are broken"),
+    )
+    lines = [sentence("RES", *longest), state(), result(2)]
     with (
         bridge("tcp", "--port", box.path, "--short") as address,
         socket.create_connection(address, timeout=LONG_S) as peer,
@@ -76,7 +74,7 @@ def test_the_short_form_fits_a_string_of_80_characters(box):
     assert [one.kind for one in told] == ["ANS", "RES", "STA", "RES"]
     assert all(one.summed and not one.error for one in told)
     assert told[0].fields[:2] == ["START", "error"]
-    assert told[1].fields[:5] == [str(value) for value in LONGEST[:5]]
+    assert told[1].fields[:5] == [str(value) for value in longest[:5]]
     assert told[3].fields == read(result(2)).fields[: len(told[3].fields)]
 
 
@@ -153,14 +151,14 @@ def test_a_browser_commands_nothing(box, pieces):
     assert {s.kind for s in box.heard} == {"ID"}
 
 
-def ask_often(client: Palpate) -> None:
-    """Ask until the bridge has noticed that the line is gone."""
-    for _ in range(1000):
-        client.ask("ID", timeout_s=LONG_S)
-
-
 def test_a_line_that_is_gone(box):
     """A command is answered with the reason; when the line is back the same connection works."""
+
+    def ask_often(client: Palpate) -> None:
+        """Ask until the bridge has noticed that the line is gone."""
+        for _ in range(1000):
+            client.ask("ID", timeout_s=LONG_S)
+
     with (
         bridge("tcp", "--port", box.path, "--allow-writes") as address,
         Palpate(url(address), timeout_s=LONG_S) as client,

@@ -27,8 +27,6 @@ START = (
 )
 """`palpate` with its settings elsewhere than in /etc."""
 LIMIT_S = 120
-MANY = 40
-"""Lines of the bridge until both fingers have answered a sweep."""
 
 
 class Pair:
@@ -85,10 +83,12 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
 
 def test_a_good_pair_is_answered_as_one_hand(pair: Pair):
     """Both fingers are answered, then the hand, without a word about a fault, until SIGTERM."""
+    # Lines of the bridge until both fingers have answered a sweep
+    many = 40
     bridge = pair.hand()
     assert bridge.stdout
     answers: list[tuple[str, Answer]] = []
-    for line, _ in zip(bridge.stdout, range(MANY), strict=False):
+    for line, _ in zip(bridge.stdout, range(many), strict=False):
         said = sentences.read(line.encode())
         if said.kind in ("FIN", "RES"):
             read = Answer.of_finger if said.kind == "FIN" else Answer.of

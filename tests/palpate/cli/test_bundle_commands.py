@@ -32,15 +32,15 @@ def settings(tmp_path: Path) -> Config:
     return config.load(None, store, site=Path("/dev/null"))
 
 
-def streaming(settings: Config, health: Health | None) -> object:
-    """The format that an install learns from a service in this state; None without a service."""
-    if health:
-        StatusFile(settings.store.status, SystemClock()).turn(health)
-    return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
-
-
 def test_a_bundle_for_another_skin_is_refused_with_both_formats(settings):
     """Known by the bundle that runs; another window is accepted, any for an unknown skin."""
+
+    def streaming(settings: Config, health: Health | None) -> object:
+        """The format that an install learns from a service in this state; None without it."""
+        if health:
+            StatusFile(settings.store.status, SystemClock()).turn(health)
+        return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
+
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
     assert streaming(settings, HEALTH._replace(skin="mismatch", streams=False)) is None

@@ -13,7 +13,6 @@ from tests.factories import deliveries, toy_bundle
 from tests.factories.deliveries import Delivery
 
 pytestmark = deliveries.NEEDED
-VIRTUAL = ("--sim", "skin", "--virtual", "--sweeps", "1")
 ALLOWED = ("--set", "classifier.allow_unsigned=true")
 SAID = "unsigned bundles are allowed: classifier.allow_unsigned = true"
 
@@ -86,12 +85,13 @@ def test_simulations_take_any_bundle(box, capsys):
 
 def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypatch, capsys):
     """While it is on; status file and feed have it."""
+    virtual = ("--sim", "skin", "--virtual", "--sweeps", "1")
     monkeypatch.setattr(StatusFile, "stopping", lambda self: None)
     for options, said in ((ALLOWED, True), ((), False)):
-        assert main(["run", *VIRTUAL, *of(box), *options]) == 0
+        assert main(["run", *virtual, *of(box), *options]) == 0
         assert (SAID in capsys.readouterr().err) == said
         main(["status", *of(box)])
         assert (SAID in capsys.readouterr().out) == said
         assert bool(json.loads((box.folder / "status.json").read_text())["unsigned"]) == said
-        main(["check", *VIRTUAL[:3], *of(box), *options])
+        main(["check", *virtual[:3], *of(box), *options])
         assert (f"ok    signatures     warning: {SAID}" in capsys.readouterr().out) == said

@@ -300,23 +300,22 @@ def test_sentences_arrive_whole_and_threads_do_not_mix(speaking, box):
     assert (names, states) == (["mine"] * 8, ["streaming"] * 8)
 
 
-def accepted(server: socket) -> socket | None:
-    """The next connection, None where none has come yet."""
-    return server.accept()[0] if select.select([server], [], [], 0.1)[0] else None
-
-
-class ShiftedClock(SystemClock):
-    """The real clock, which a test can put forward."""
-
-    ahead_ns = 0
-
-    def now_ns(self) -> int:
-        """Real time plus an added time."""
-        return super().now_ns() + self.ahead_ns
-
-
 def test_a_socket_in_place_of_a_port():
     """`socket://host:port` by pyserial; closed or silent, it is opened again."""
+
+    class ShiftedClock(SystemClock):
+        """The real clock, which a test can put forward."""
+
+        ahead_ns = 0
+
+        def now_ns(self) -> int:
+            """Real time plus an added time."""
+            return super().now_ns() + self.ahead_ns
+
+    def accepted(server: socket) -> socket | None:
+        """The next connection, None where none has come yet."""
+        return server.accept()[0] if select.select([server], [], [], 0.1)[0] else None
+
     clock = ShiftedClock()
     with create_server(("127.0.0.1", 0)) as server:
         server.settimeout(LONG_S)

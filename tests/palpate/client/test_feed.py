@@ -151,21 +151,21 @@ def test_a_box_is_read_and_its_reason_is_kept(tmp_path):
     offered.feed.stopping()
 
 
-@contextmanager
-def running(path: Path) -> Iterator[subprocess.Popen]:
-    """`palpate run` on a simulated skin, with its feed at `path`; killed at the end."""
-    words = ["-m", "palpate", "run", "--sim", "skin", "--set", f"store.runtime={path.parent}"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, *words], cwd=ROOT, **quiet) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 @pytest.mark.slow
 def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path):
     """One reader, two processes; the end gives its reason."""
+
+    @contextmanager
+    def running(path: Path) -> Iterator[subprocess.Popen]:
+        """`palpate run` on a simulated skin, with its feed at `path`; killed at the end."""
+        words = ["-m", "palpate", "run", "--sim", "skin", "--set", f"store.runtime={path.parent}"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        with subprocess.Popen([sys.executable, *words], cwd=ROOT, **quiet) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
+
     path = tmp_path / "feed.sock"
     pids = []
     with Feed(path, frames_hz=5, sweeps=True) as feed:

@@ -225,20 +225,20 @@ def test_a_second_writer_is_refused(path):
     VerdictFile(path).close()
 
 
-class ScriptedFeed(Feed):
-    """A feed of these lines."""
-
-    def __init__(self, *lines: dict) -> None:
-        super().__init__("/nonexistent")
-        self.left = [*lines]
-
-    def read(self, timeout_s: float = 1.0) -> dict | None:
-        """The next of them."""
-        return self.left.pop(0) if self.left else None
-
-
 def test_the_bridge_writes_verdicts_alone(path, caplog):
     """Other lines are passed over, a line of a later version is left out with a warning."""
+
+    class ScriptedFeed(Feed):
+        """A feed of these lines."""
+
+        def __init__(self, *lines: dict) -> None:
+            super().__init__("/nonexistent")
+            self.left = [*lines]
+
+        def read(self, timeout_s: float = 1.0) -> dict | None:
+            """The next of them."""
+            return self.left.pop(0) if self.left else None
+
     now_s = time.monotonic()
     lines = [feed_lines.hello(), feed_lines.health(1.0), feed_lines.verdict(1, now_s - 5)]
     lines += [{"type": "verdict"}, feed_lines.verdict(2, now_s)]

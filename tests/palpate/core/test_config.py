@@ -19,7 +19,6 @@ from palpate.core.errors import ConfigError
 from tests.factories.paths import ROOT
 
 FIRMWARE = ROOT / "firmware_config"
-BOARDS = sorted(path.stem.removeprefix("board-") for path in FIRMWARE.glob("board-*.toml"))
 
 
 @pytest.fixture
@@ -231,35 +230,36 @@ HEADER = {
 """The lines of the 40-pin header, by pin."""
 
 
-def _page(board: str) -> str:
-    return (FIRMWARE / f"board-{board}.toml").read_text()
-
-
-def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
-    """The drawing of a board file: {pin: name}, {role: name}, a role with the box's arrow."""
-    rows = re.findall(
-        r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
-        r"]+))?$",
-        _page(board),
-        re.MULTILINE,
-    )
-    pins, roles = {}, {}
-    for left_role, left_way, left, odd, even, right, right_way, right_role in rows:
-        pins |= {int(odd): left, int(even): right}
-        for role, way, inward, line in (
-            (left_role, left_way, ">", left),
-            (right_role, right_way, "<", right),
-        ):
-            if role:
-                roles[f"{'in' if way == inward else 'out'} {role}"] = line
-    return pins, roles
-
-
-@pytest.mark.parametrize("board", BOARDS)
+@pytest.mark.parametrize(
+    "board", sorted(path.stem.removeprefix("board-") for path in FIRMWARE.glob("board-*.toml"))
+)
 def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
     """Each pin and role is where the header has it."""
+
+    def page(board: str) -> str:
+        return (FIRMWARE / f"board-{board}.toml").read_text()
+
+    def drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
+        """The drawing of a board file: {pin: name}, {role: name}, a role with the box's arrow."""
+        rows = re.findall(
+            r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
+            r"]+))?$",
+            page(board),
+            re.MULTILINE,
+        )
+        pins, roles = {}, {}
+        for left_role, left_way, left, odd, even, right, right_way, right_role in rows:
+            pins |= {int(odd): left, int(even): right}
+            for role, way, inward, line in (
+                (left_role, left_way, ">", left),
+                (right_role, right_way, "<", right),
+            ):
+                if role:
+                    roles[f"{'in' if way == inward else 'out'} {role}"] = line
+        return pins, roles
+
     c = _shipped(board)
-    pins, roles = _drawing(board)
+    pins, roles = drawing(board)
     assert pins == HEADER
     wired = {f"in {name}": getattr(c.trigger, name) for name in ("start", "stop", "new_object")}
     wired |= {
@@ -268,7 +268,7 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
     }
     wired |= {f"out class_bits {i}": name for i, name in enumerate(c.output.class_bits)}
     assert roles == wired | {"out serial TXD": "GPIO14", "in serial RXD": "GPIO15"}
-    beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", _page(board), re.MULTILINE)
+    beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", page(board), re.MULTILINE)
     names, numbers = (re.findall(r"\w+", " ".join(column)) for column in zip(*beside, strict=True))
     assert names == [HEADER[int(pin)] for pin in numbers] == list(wired.values())
 

@@ -69,21 +69,24 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box):
     assert box.store.learn(grown(box, "felt"))
 
 
-def check_refused(
-    box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
-) -> None:
-    """From a folder and from its own enrolment; the box continues with the same bundle."""
-    before = box.store.current
-    for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.learn(files)):
-        with pytest.raises(kind, match=why):
-            deliver()
-    assert box.store.current == before
-
-
 def test_no_part_can_be_exchanged(box, tmp_path):
     """Refused: an enrolment without a signature, signed by another box, or by a signer of bundles;
     labels of another bundle, other labels of this bundle; a base that is unsigned, altered, or by
     an unknown signer. So the box's private key can add labels and nothing else."""
+
+    def check_refused(
+        box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
+    ) -> None:
+        """From a folder and from its own enrolment; the box continues with the same bundle."""
+        before = box.store.current
+        for deliver in (
+            lambda: box.store.install(box.copied(files)),
+            lambda: box.store.learn(files),
+        ):
+            with pytest.raises(kind, match=why):
+                deliver()
+        assert box.store.current == before
+
     box.committed(1)
     good, key = grown(box), box.enrolment_key
     labels = {name: good[name] for name in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)}

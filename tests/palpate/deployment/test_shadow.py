@@ -31,7 +31,6 @@ from tests.factories.simulated_box import SECOND
 from tests.factories.slow_disk import SlowDisk
 
 IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim", *[0] * 6)
-SWEEPING = IDLE._replace(sweeping=True)
 
 
 class Side:
@@ -129,11 +128,12 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
 
 def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
     """Afterwards one file in each turn, up to the limit."""
+    sweeping = IDLE._replace(sweeping=True)
     monkeypatch.setattr(shadow, "KEPT", 2)
     pair = side(renamed)
     for one in (A, B):
         pair.shadow.sweep(one, pair.current(one), {"tare": pair.tare.tolist()})
-    pair.turn(SWEEPING, 10)
+    pair.turn(sweeping, 10)
     assert (pair.kept(), pair.written().compared) == ([], 0)
     for kept, compared in ((1, 0), (2, 0), (2, 2)):
         pair.turn(n=1)
@@ -215,29 +215,28 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path):
         assert (found.compared, found.agreed, found.later) == counts
 
 
-class FailingClassifier:
-    """A candidate whose model fails on some sweeps, with an exception of its own."""
-
-    def __init__(
-        self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
-    ) -> None:
-        self.format, self.taxels, self.bundle = run.format, run.taxels, run.bundle
-        self.self_test, self._run, self._fails, self._act = run.self_test, run, fails, act
-
-    def __call__(self, one: Sweep):
-        """Fail, or judge."""
-        if self._fails(one):
-            self._act()
-        return self._run(one)
-
-
-def strange() -> None:
-    """An error like those of onnxruntime, whose only common base is Exception."""
-    raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
-
-
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged):
     """Three in a row or slow ones; one line; stopped."""
+
+    def strange() -> None:
+        """An error like those of onnxruntime, whose only common base is Exception."""
+        raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
+
+    class FailingClassifier:
+        """A candidate whose model fails on some sweeps, with an exception of its own."""
+
+        def __init__(
+            self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
+        ) -> None:
+            self.format, self.taxels, self.bundle = run.format, run.taxels, run.bundle
+            self.self_test, self._run, self._fails, self._act = run.self_test, run, fails, act
+
+        def __call__(self, one: Sweep):
+            """Fail, or judge."""
+            if self._fails(one):
+                self._act()
+            return self._run(one)
+
     pair = side()
     pair.shadow._classifier = FailingClassifier(
         pair.shadow._classifier, lambda s: s.id != 3, strange

@@ -311,13 +311,13 @@ def test_a_box_at_work_commits(box, rigged):
     assert box.standing.committed
 
 
-def failed() -> Verdict:
-    """The answer to a sweep on which the bundle failed."""
-    return replace(verdict(""), status=Status.FAILED)
-
-
 def test_a_failed_sweep_begins_the_trial_anew(box):
     """Sweeps and time before it do not count, also not those that were recorded already."""
+
+    def failed() -> Verdict:
+        """The answer to a sweep on which the bundle failed."""
+        return replace(verdict(""), status=Status.FAILED)
+
     trial = box.tried()
     for _ in range(4):
         trial.answered(verdict())

@@ -157,28 +157,28 @@ def test_refused_sweeps_keep_their_status(default_bundle, status):
     assert (v.status, v.label, v.fused, len(v.scores)) == (status, "", 0, 0)
 
 
-def of_features(weights: np.ndarray) -> dict[str, bytes]:
-    """The files of the default bundle with another model: input L [1, n] times weights [n, 6]."""
-    onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
-    graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("MatMul", ["features", "W"], ["logits"])],
-        "g",
-        [onnx.helper.make_tensor_value_info("features", 1, [1, len(weights)])],
-        [onnx.helper.make_tensor_value_info("logits", 1, [1, 6])],
-        [onnx.numpy_helper.from_array(weights.astype(np.float32), "W")],
-    )
-    opset = [onnx.helper.make_opsetid("", 18)]
-    made = onnx.helper.make_model(graph, opset_imports=opset, ir_version=9)
-    files = bundle.files(bundle.DEFAULT) | {bundle.MODEL: made.SerializeToString()}
-    entries = {name: bundle.file_entry(files[name]) for name in (bundle.MODEL, bundle.GOLDEN)}
-    without = {"early": None, "known": None, "displacement": None}
-    manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
-    manifest = replace(manifest, input="L", files=entries, **without)
-    return files | {bundle.MANIFEST: manifest.json()}
-
-
 def test_features_go_through_the_same_runtime():
     """Input L gets three features, as by numpy; of four it is refused."""
+
+    def of_features(weights: np.ndarray) -> dict[str, bytes]:
+        """Files of the default bundle with another model: input L [1, n] times weights [n, 6]."""
+        onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+        graph = onnx.helper.make_graph(
+            [onnx.helper.make_node("MatMul", ["features", "W"], ["logits"])],
+            "g",
+            [onnx.helper.make_tensor_value_info("features", 1, [1, len(weights)])],
+            [onnx.helper.make_tensor_value_info("logits", 1, [1, 6])],
+            [onnx.numpy_helper.from_array(weights.astype(np.float32), "W")],
+        )
+        opset = [onnx.helper.make_opsetid("", 18)]
+        made = onnx.helper.make_model(graph, opset_imports=opset, ir_version=9)
+        files = bundle.files(bundle.DEFAULT) | {bundle.MODEL: made.SerializeToString()}
+        entries = {name: bundle.file_entry(files[name]) for name in (bundle.MODEL, bundle.GOLDEN)}
+        without = {"early": None, "known": None, "displacement": None}
+        manifest = bundle.Manifest.parse(files[bundle.MANIFEST])
+        manifest = replace(manifest, input="L", files=entries, **without)
+        return files | {bundle.MANIFEST: manifest.json()}
+
     weights = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32)
     made = bundle.from_files(of_features(weights), "here")
     want = features.compute("L", made.golden[0], 750.0) @ weights
@@ -500,21 +500,19 @@ def test_a_model_that_gives_no_number_is_unknown(tmp_path):
     assert it(toy_bundle.sweep(0, 0, object=1, format=format)).fused == 1
 
 
-P = 1 / (1 + np.exp(-0.6))
-"""Probability of "a" in a borderline sweep: .65, since two labels count."""
-
-
 def borderline(**more: Any) -> Sweep:
     return toy_bundle.sweep(2.8, -1, **more)
 
 
 def test_sweeps_are_requested_until_the_probability_suffices(toy):
     """After n sweeps the odds are to the power n."""
+    # Probability of "a" in a borderline sweep: .65, since two labels count
+    p = 1 / (1 + np.exp(-0.6))
     it = box(toy, min_probability=0.85, max_sweeps=5)
     given = [it(borderline(object=1)) for _ in range(4)]
     assert [v.status for v in given] == [Status.UNSURE] * 2 + [Status.OK] * 2
     assert [(v.label, v.fused) for v in given] == [("a", n) for n in (1, 2, 3, 4)]
-    odds = (P / (1 - P)) ** np.arange(1, 5)
+    odds = (p / (1 - p)) ** np.arange(1, 5)
     assert [v.probability for v in given] == pytest.approx(odds / (1 + odds), abs=2e-3)
     assert it(borderline(object=2)).status is Status.UNSURE
 

@@ -277,23 +277,23 @@ def test_one_run_of_the_graph_at_each_step(rigged, monkeypatch):
     assert all((rest == rest[0]).all() and rest.all() for rest in rests)
 
 
-def spoiled(fault: str) -> np.ndarray:
-    """A slide that is clear to the toy, on a faulty skin."""
-    frames = slid(60)
-    if fault == "saturated":
-        frames[:, :, 0] = 255 - (np.arange(SLIDE) % 4 == 0)[:, None]
-    elif fault == "stuck-taxel":
-        frames[:, 1, 0] = 200
-    elif fault == "dead-taxel":
-        frames[:, 1, 1] = 0
-    elif fault == "no-contact":
-        frames = frames // 50
-    return frames
-
-
 @pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact", ""])
 def test_a_spoiled_skin_is_not_decided_early(rigged, fault):
     """The whole sweep reports the fault; without it, it is early."""
+
+    def spoiled(fault: str) -> np.ndarray:
+        """A slide that is clear to the toy, on a faulty skin."""
+        frames = slid(60)
+        if fault == "saturated":
+            frames[:, :, 0] = 255 - (np.arange(SLIDE) % 4 == 0)[:, None]
+        elif fault == "stuck-taxel":
+            frames[:, 1, 0] = 200
+        elif fault == "dead-taxel":
+            frames[:, 1, 1] = 0
+        elif fault == "no-contact":
+            frames = frames // 50
+        return frames
+
     want = [(fault, "", 1.0)] if fault else [("ok", "left", 0.2)]
     assert answers(rigged, spoiled(fault), model=toy((0.5,) * STEPS)) == want
 
@@ -398,19 +398,19 @@ def test_without_ok_the_sweep_goes_on(rigged):
     assert found == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
 
 
-class Ticking(rig.VirtualClock):
-    """Each call takes a microsecond, so that events of one turn have different times."""
-
-    def now_ns(self) -> int:
-        """A little later than before."""
-        self.sleep_until(super().now_ns() + 1000)
-        return super().now_ns()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 30])
 def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
     """Lost packets, any answer, a stop edge near the last step."""
+
+    class Ticking(rig.VirtualClock):
+        """Each call takes a microsecond, so that events of one turn have different times."""
+
+        def now_ns(self) -> int:
+            """A little later than before."""
+            self.sleep_until(super().now_ns() + 1000)
+            return super().now_ns()
+
     rng, model = np.random.default_rng(7), toy((0.97, 0.95, 0.93, 0.7))
     slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]
     simulated = simulated_slides(

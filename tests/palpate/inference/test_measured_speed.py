@@ -17,11 +17,6 @@ from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories.toy_bundle import sweep_of, told
 
-FAST = "slid at 60 mm/s, trained 28 to 33"
-NO_NUMBER = "the model gives no number"
-NOTHING = np.full(6, np.nan)
-"""Probabilities of a model that gives no number: the sweep is unknown."""
-
 
 def slid(speed: float = 2.0, material: str = "plastic rough", **more: Any) -> Sweep:
     """A sweep at a multiple of 30 mm/s, towards row 4."""
@@ -34,11 +29,6 @@ def trained(of: Bundle, **changes: Any) -> Bundle:
     """A bundle that was trained at 28 to 33 mm/s, and judges no disturbance."""
     changes |= {"speeds": SpeedRange(28.0, 33.0), "disturbances": None}
     return replace(of, manifest=replace(of.manifest, **changes))
-
-
-def untrained(of: Bundle) -> Bundle:
-    """A bundle that does not state its speeds."""
-    return replace(of, manifest=replace(of.manifest, speeds=None, disturbances=None))
 
 
 def box(of: Bundle, **rule: Any) -> Classifier:
@@ -72,29 +62,38 @@ def test_a_verdict_has_the_measured_slide_or_no_such_fields(default_bundle):
 
 def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle):
     """Unsure, undecided and unknown; before the other findings, after a displacement."""
+    # Probabilities of a model that gives no number: the sweep is unknown
+    nothing = np.full(6, np.nan)
+    no_number = "the model gives no number"
+    fast = "slid at 60 mm/s, trained 28 to 33"
     probable = np.array([0.9, 0.1, 0, 0, 0, 0])
     unsure = box(trained(default_bundle), min_probability=0.95)
     undecided = box(trained(default_bundle), min_probability=0.95, max_sweeps=1)
     found = [
         concluded(unsure, slid(), probable),
         concluded(undecided, slid(), probable),
-        concluded(unsure, slid(), NOTHING),
+        concluded(unsure, slid(), nothing),
     ]
     assert [(v.status, v.detail) for v in found] == [
-        (Status.UNSURE, FAST),
-        (Status.UNDECIDED, FAST),
-        (Status.UNKNOWN, f"{FAST}; {NO_NUMBER}"),
+        (Status.UNSURE, fast),
+        (Status.UNDECIDED, fast),
+        (Status.UNKNOWN, f"{fast}; {no_number}"),
     ]
     place = default_bundle.manifest.contact
     assert place
     far = replace(place, rows_mm=(0.0,), cols_mm=(0.0,))
-    v = concluded(box(trained(default_bundle, contact=far)), slid(), NOTHING)
-    assert v.detail == f"{v.displacement}; {FAST}; {NO_NUMBER}"
+    v = concluded(box(trained(default_bundle, contact=far)), slid(), nothing)
+    assert v.detail == f"{v.displacement}; {fast}; {no_number}"
     assert v.displacement.startswith("moved")
 
 
 def test_other_answers_do_not_report_it(default_bundle):
     """An answer that is ok, a speed of training, a bundle without the range."""
+
+    def untrained(of: Bundle) -> Bundle:
+        """A bundle that does not state its speeds."""
+        return replace(of, manifest=replace(of.manifest, speeds=None, disturbances=None))
+
     sure, probable = np.eye(6)[0], np.array([0.9, 0.1, 0, 0, 0, 0])
     found = [
         concluded(box(trained(default_bundle)), slid(), sure),

@@ -124,12 +124,6 @@ def any_material(made: Bundle, pattern: float | None) -> Classifier:
     return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
 
 
-def sure(made: Bundle) -> Manifest:
-    """The manifest of a bundle that answers early whatever the material is."""
-    m = made.manifest
-    return replace(m, early=replace(m.early, least=(0.01,) * 9, agree=1, limits=(1e9,) * 9))
-
-
 def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
     """Without the limit it has a label; `slides` is checked, too."""
     assert packaged.manifest.sliding
@@ -146,6 +140,12 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
 
 def test_an_early_answer_needs_a_pattern_too(packaged):
     """Of a slide four tenths are; of a mixed window only without the limit."""
+
+    def sure(made: Bundle) -> Manifest:
+        """The manifest of a bundle that answers early whatever the material is."""
+        m = made.manifest
+        return replace(m, early=replace(m.early, least=(0.01,) * 9, agree=1, limits=(1e9,) * 9))
+
     early, unlimited = (
         EarlyExit(any_material(replace(packaged, manifest=sure(packaged)), pattern))
         for pattern in (packaged.manifest.sliding.pattern, None)

@@ -32,11 +32,6 @@ from tests.rig.backends import Backend, Skin, mocks, skins
 
 SECOND = 1_000_000_000
 LIMIT_S = 10
-SETTLE_S = 2.2
-"""Until the skin's clock is well known (DeviceClock), time stamps may shift by the delays of a busy
-machine."""
-RETRIED_S = 0.6
-"""A lost skin is searched for within this time."""
 Need = Callable[..., Backend]
 
 
@@ -144,9 +139,12 @@ def check_content(u: Backend, frames: Frames) -> None:
 
 def test_streams_without_a_gap(need):
     """Every frame once, in order, later than the last, never ahead; then the skin is released."""
+    # Until the skin's clock is well known (DeviceClock), time stamps may shift by the delays of a
+    # busy machine
+    settle_s = 2.2
     u = need("skin")
     with SensorReader(u) as reader:
-        reader.seconds(SETTLE_S)
+        reader.seconds(settle_s)
         frames = reader.frames(800)
         assert (frames.t_ns <= now(u)).all()
         assert (np.diff(frames.seq) == 1).all()
@@ -200,6 +198,16 @@ def test_unplugged_in_mid_read(need):
 
 def test_driver_taken_and_given_back(need):
     """Without its driver it is lost; with it, it streams again, and nothing is left open."""
+
+    def timers() -> int:
+        """Kernel timers of this process; a context of libusb has one."""
+        return sum(
+            os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]")
+            for fd in os.listdir("/proc/self/fd")
+        )
+
+    # A lost skin is searched for within this time
+    retried_s = 0.6
     u = need("unbind")
     with SensorReader(u) as reader:
         reader.frames(100)
@@ -207,20 +215,12 @@ def test_driver_taken_and_given_back(need):
         for _ in range(3):
             u.unbind(True)
             reader.state("lost")
-            assert len(reader.seconds(RETRIED_S)) == 0
+            assert len(reader.seconds(retried_s)) == 0
             u.unbind(False)
             check_content(u, reader.frames(100))
             held.append(timers())
         assert reader.sensor.counters.enumerations == 4
         assert held[-1] == held[0]
-
-
-def timers() -> int:
-    """Kernel timers of this process; a context of libusb has one."""
-    return sum(
-        os.path.realpath(f"/proc/self/fd/{fd}").endswith("[timerfd]")
-        for fd in os.listdir("/proc/self/fd")
-    )
 
 
 def test_serial_number_chooses(need):

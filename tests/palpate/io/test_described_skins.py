@@ -155,36 +155,36 @@ class SparseFrames:
         return values
 
 
-class VirtualPort:
-    """A port in virtual time, behind which a skin takes frames and answers."""
-
-    def __init__(self, wire: Wire, source: SparseFrames, clock: VirtualClock) -> None:
-        self._wire, self._source, self._clock = wire, source, clock
-        self._taken, self._data, self._begun_ns = 0, b"", clock.now_ns()
-
-    def write(self, data: bytes) -> None:
-        """The answer waits to be read."""
-        self._data += self._wire.receive(data)
-
-    def read(self, size: int, timeout_ms: int) -> bytes:
-        """What came within the timeout, in pieces."""
-        until_ns = self._clock.now_ns() + timeout_ms * 1_000_000
-        while not self._data and self._clock.now_ns() < until_ns:
-            due_ns = self._begun_ns + round((self._taken + 1) * self._wire.period_ns)
-            self._clock.sleep_until(min(until_ns, due_ns))
-            if due_ns <= self._clock.now_ns():
-                self._data += self._wire.frame(self._source.frame(self._taken), 0)
-                self._taken += 1
-        piece, self._data = self._data[:200], self._data[200:]
-        return piece
-
-    def close(self) -> None:
-        """Nothing is left open."""
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_each_kind_streams(name: str) -> None:
     """At the rate of its profile: whole frames, and nothing that was not sent."""
+
+    class VirtualPort:
+        """A port in virtual time, behind which a skin takes frames and answers."""
+
+        def __init__(self, wire: Wire, source: SparseFrames, clock: VirtualClock) -> None:
+            self._wire, self._source, self._clock = wire, source, clock
+            self._taken, self._data, self._begun_ns = 0, b"", clock.now_ns()
+
+        def write(self, data: bytes) -> None:
+            """The answer waits to be read."""
+            self._data += self._wire.receive(data)
+
+        def read(self, size: int, timeout_ms: int) -> bytes:
+            """What came within the timeout, in pieces."""
+            until_ns = self._clock.now_ns() + timeout_ms * 1_000_000
+            while not self._data and self._clock.now_ns() < until_ns:
+                due_ns = self._begun_ns + round((self._taken + 1) * self._wire.period_ns)
+                self._clock.sleep_until(min(until_ns, due_ns))
+                if due_ns <= self._clock.now_ns():
+                    self._data += self._wire.frame(self._source.frame(self._taken), 0)
+                    self._taken += 1
+            piece, self._data = self._data[:200], self._data[200:]
+            return piece
+
+        def close(self) -> None:
+            """Nothing is left open."""
+
     kind, clock = KINDS[name], VirtualClock()
     source, profile = SparseFrames(kind.shape), replace(kind.profile, rate_hz=40.0)
     wire = kind.wire(500.0 if requests(profile) else profile.rate_hz)

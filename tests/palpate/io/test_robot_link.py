@@ -28,8 +28,6 @@ from palpate.sim import gpio, rig
 from palpate.tools import pseudo_terminal
 from tests.factories.paths import ROOT
 
-TIOCGEXCL = 0x80045440
-"""Asks whether a terminal is shut to others (asm-generic/ioctls.h)."""
 PROTOCOL = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
 
 
@@ -181,16 +179,18 @@ def test_a_port_that_is_not_there_and_comes(tmp_path):
         sink.close()
 
 
-def is_shut(port: int) -> bool:
-    """Whether the kernel refuses a port to all but root."""
-    return bool(struct.unpack("i", fcntl.ioctl(port, TIOCGEXCL, bytes(4)))[0])
-
-
 @pytest.mark.parametrize("real", [True, False])
 def test_a_port_is_kept_from_others(monkeypatch, real):
     """While the box has a port the kernel refuses it to others; after closing it is free, even if
     another had it open. A pseudo-terminal is not shut: it would stay so if the box is killed while
     the other end is open."""
+    # Asks whether a terminal is shut to others (asm-generic/ioctls.h)
+    tiocgexcl = 0x80045440
+
+    def is_shut(port: int) -> bool:
+        """Whether the kernel refuses a port to all but root."""
+        return bool(struct.unpack("i", fcntl.ioctl(port, tiocgexcl, bytes(4)))[0])
+
     if real:
         monkeypatch.setattr(serial_port, "PSEUDO_TERMINALS", range(0))
     with pseudo_terminal.pair() as (_, name), open(name, "rb", buffering=0) as other:
@@ -214,11 +214,6 @@ def lines_on(bits: int) -> tuple[Lines, gpio.SimGpio]:
     return Lines(OutputConfig(result_valid="VALID", class_bits=names), chip, clock), chip
 
 
-def levels(chip: gpio.SimGpio) -> dict[str, bool]:
-    """The present levels of the lines."""
-    return {name: level for _, name, level in chip.written}
-
-
 @pytest.mark.parametrize(
     ("status", "on"),
     [
@@ -228,6 +223,11 @@ def levels(chip: gpio.SimGpio) -> dict[str, bool]:
 )
 def test_the_code_of_an_answer(status, on):
     """The label's code if it is ok, else code 0; RESULT VALID rises with either."""
+
+    def levels(chip: gpio.SimGpio) -> dict[str, bool]:
+        """The present levels of the lines."""
+        return {name: level for _, name, level in chip.written}
+
     lines, chip = lines_on(2)
     sink = LineSink(lines, LABELS)
     sink.answered(verdict())
@@ -289,30 +289,30 @@ def test_an_echo_with_changes_is_not_answered_without_end(change):
         sink.close()
 
 
-class StandardOutput:
-    """Stands for sys.stdout; writing raises an error."""
-
-    def __init__(self, error: Exception | None) -> None:
-        self.error, self.buffer, self.written = error, self, b""
-
-    def fileno(self) -> int:
-        raise io.UnsupportedOperation
-
-    def write(self, data: bytes) -> None:
-        if self.error:
-            raise self.error
-        self.written += data
-
-    def flush(self) -> None:
-        """Nothing is kept back."""
-
-
 @pytest.mark.parametrize(
     "error",
     [OSError(28, "No space left"), OSError(27, "File too large"), ValueError("closed file")],
 )
 def test_standard_output_that_takes_nothing(monkeypatch, error):
     """Sentences are dropped and counted, with the reason; they go on once it works again."""
+
+    class StandardOutput:
+        """Stands for sys.stdout; writing raises an error."""
+
+        def __init__(self, error: Exception | None) -> None:
+            self.error, self.buffer, self.written = error, self, b""
+
+        def fileno(self) -> int:
+            raise io.UnsupportedOperation
+
+        def write(self, data: bytes) -> None:
+            if self.error:
+                raise self.error
+            self.written += data
+
+        def flush(self) -> None:
+            """Nothing is kept back."""
+
     output = StandardOutput(error)
     monkeypatch.setattr(sys, "stdout", output)
     port = StdoutPort()

@@ -50,48 +50,45 @@ def test_a_mark_among_the_numbers_of_some_frames(cut):
     assert len(found) == 8 - (cut > 0)
 
 
-FULL = SkinProfile(
-    about="a",
-    source="s",
-    codec="fixed",
-    marker=b"\xf0\x0f",
-    trailer=b"\r\n",
-    skip_before=2,
-    skip_after=1,
-    sequence="uint16",
-    sequence_at=1,
-    sequence_order="big",
-    checksum="crc16-modbus",
-    checksum_from=2,
-    number="uint16",
-    byte_order="little",
-    checksum_order="big",
-    rows=2,
-    cols=3,
-)
-
-
-def full(i: int, wrong: int = 0) -> bytes:
-    """Frame `i` of FULL: mark, ignored byte, count, ignored, six numbers, ignored, sum, CR LF."""
-    body = b"\x07" + struct.pack(">H", i % 65536) + b"\x08"
-    body += struct.pack("<6H", *((i * 31 + k) % 4000 for k in range(6))) + b"\x09"
-    return b"\xf0\x0f" + body + struct.pack(">H", modbus(body) ^ wrong) + b"\r\n"
-
-
-def modbus(data: bytes) -> int:
-    """CRC-16/MODBUS bit by bit, as its specification has it."""
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-    return value
-
-
 def test_a_frame_with_count_checksum_and_ignored_bytes():
     """All that a profile can say; a frame with a wrong checksum is garbage."""
+    profile = SkinProfile(
+        about="a",
+        source="s",
+        codec="fixed",
+        marker=b"\xf0\x0f",
+        trailer=b"\r\n",
+        skip_before=2,
+        skip_after=1,
+        sequence="uint16",
+        sequence_at=1,
+        sequence_order="big",
+        checksum="crc16-modbus",
+        checksum_from=2,
+        number="uint16",
+        byte_order="little",
+        checksum_order="big",
+        rows=2,
+        cols=3,
+    )
+
+    def modbus(data: bytes) -> int:
+        """CRC-16/MODBUS bit by bit, as its specification has it."""
+        value = 0xFFFF
+        for byte in data:
+            value ^= byte
+            for _ in range(8):
+                value = value >> 1 ^ (0xA001 if value & 1 else 0)
+        return value
+
+    def full(i: int, wrong: int = 0) -> bytes:
+        """Frame `i` of it: mark, ignored byte, count, ignored, six numbers, ignored, sum, end."""
+        body = b"\x07" + struct.pack(">H", i % 65536) + b"\x08"
+        body += struct.pack("<6H", *((i * 31 + k) % 4000 for k in range(6))) + b"\x09"
+        return b"\xf0\x0f" + body + struct.pack(">H", modbus(body) ^ wrong) + b"\r\n"
+
     frames = [full(i, wrong=i == 65533) for i in range(65530, 65540)]
-    found = decoded(FULL, b"\r\n" + b"".join(frames) + frames[0])
+    found = decoded(profile, b"\r\n" + b"".join(frames) + frames[0])
     good = [i for i in range(65530, 65540) if i != 65533]
     assert found.counts.tolist() == [i % 65536 for i in good]
     assert found.taxels[0].tolist() == [
@@ -103,7 +100,7 @@ def test_a_frame_with_count_checksum_and_ignored_bytes():
     # in parts, too
     rest, counts = Rest(), []
     for at in range(0, len(frames) * size, 17):
-        part = codec(FULL)(rest, (b"\r\n" + b"".join(frames) + frames[0])[at : at + 17])
+        part = codec(profile)(rest, (b"\r\n" + b"".join(frames) + frames[0])[at : at + 17])
         rest = part.rest
         counts += part.counts.tolist()
     assert counts == found.counts.tolist()[: len(counts)]

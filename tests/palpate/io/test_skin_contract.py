@@ -183,26 +183,26 @@ def test_wrong_rate(name, rate):
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])
 def test_a_rate_that_wanders(name):
     """2 % are followed, a tenth is a mismatch. Skins with their own clock: test_usb_sensor.py."""
+
+    def change_rate(skin: WiredSkin, rate: float) -> None:
+        """From the next frame on, frames come at `rate` times the nominal pace."""
+        port = skin.port
+        now = port.taken_ns(port._next - 1)
+        port.period_ns = skin.format.period_ns / rate
+        port.begun_ns = now - round(port._next * port.period_ns)
+        port._plan()
+
     skin = WiredSkin(name)
     skin.seconds(4)
     for rate in (1.02, 0.98, 1.0):
-        _change_rate(skin, rate)
+        change_rate(skin, rate)
         frames = skin.seconds(6)
         assert skin.sensor.state == "streaming"
         assert len(frames) > 5 * skin.format.rate_hz
     assert skin.states == ["streaming"]
-    _change_rate(skin, 0.9)
+    change_rate(skin, 0.9)
     skin.seconds(12)
     assert "mismatch" in skin.states
-
-
-def _change_rate(skin: WiredSkin, rate: float) -> None:
-    """From the next frame on, frames come at `rate` times the nominal pace."""
-    port = skin.port
-    now = port.taken_ns(port._next - 1)
-    port.period_ns = skin.format.period_ns / rate
-    port.begun_ns = now - round(port._next * port.period_ns)
-    port._plan()
 
 
 @each

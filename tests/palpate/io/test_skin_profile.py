@@ -20,8 +20,6 @@ from palpate.io.skin_profile import SkinProfile, adapted, from_json, load, warni
 from tests.factories.paths import NO_SITE, ROOT
 from tests.factories.skin_wires import FOLDER, NAMES, profile
 
-SUMMED = ("bota-serial", "dfrobot-tactile", "paxini", "synria")
-"""Delivered profiles with a checksum and without a count."""
 GOOD = 'about = "a"\nsource = "s"\ncodec = "fixed"\nmarker = "aa 55"\n'
 
 
@@ -176,13 +174,15 @@ def test_settings_that_do_not_fit(name, settings, hint):
 
 def test_what_each_lacks():
     """Only a skin that counts its frames shows loss; PROTOCOL.md announces its grid itself."""
+    # Delivered profiles with a checksum and without a count
+    summed = ("bota-serial", "dfrobot-tactile", "paxini", "synria")
     for settings in ({"grid": "4x4"}, {"rate_hz": 100.0}):
         with pytest.raises(ConfigError, match=r"skin\..*PROTOCOL"):
             adapted(SkinProfile(), SkinConfig(**settings))
     assert {name: profile(name).lacks for name in NAMES} == {
         name: ()
         if name == "papillarray"
-        else ("sequence", "time", "checksum")[: 2 if name in SUMMED else 3]
+        else ("sequence", "time", "checksum")[: 2 if name in summed else 3]
         for name in NAMES
     }
     assert SkinProfile(codec="fixed", marker=b"\xaa", sequence="uint8").lacks == (

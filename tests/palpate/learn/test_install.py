@@ -24,9 +24,6 @@ from tests.factories.sweep_sets import easy
 
 pytestmark = [deliveries.NEEDED, pytest.mark.slow]
 
-WRITES = ("put", "put_all", "write", "sync", "link", "exchange")
-"""All by which a bundle gets into the store."""
-
 
 @pytest.fixture
 def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -46,18 +43,6 @@ def store(words: list[str]) -> Any:
     return assembly.store(load(None, words[1::2], site=ROOT / "tests/factories/no-site.toml"))
 
 
-def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., Any]:
-    """A write that fails at its call number `at`."""
-
-    def run(*args: Any, **more: Any) -> Any:
-        count[0] += 1
-        if count[0] == at:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "bundle")
-        return act(*args, **more)
-
-    return run
-
-
 def test_two_that_teach_at_once_share_no_folder(tmp_path):
     """The second is refused while the first has it; what a power cut left is cleared."""
     (tmp_path / "teaching" / "old").mkdir(parents=True)
@@ -74,13 +59,27 @@ def test_two_that_teach_at_once_share_no_folder(tmp_path):
 
 def test_a_full_disk_leaves_the_bundle_in_service(box, tmp_path, monkeypatch, capsys):
     """Whichever write fails: a line, all sweeps, a whole bundle."""
+
+    def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., Any]:
+        """A write that fails at its call number `at`."""
+
+        def run(*args: Any, **more: Any) -> Any:
+            count[0] += 1
+            if count[0] == at:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "bundle")
+            return act(*args, **more)
+
+        return run
+
+    # All by which a bundle gets into the store
+    writes = ("put", "put_all", "write", "sync", "link", "exchange")
     sweeps, done, at = tmp_path / "store" / "sweeps", False, 0
     kept = sorted(path.read_bytes() for path in sweeps.iterdir())
     while not done:
         at, count = at + 1, [0]
         capsys.readouterr()
         with monkeypatch.context() as patched:
-            for name in WRITES:
+            for name in writes:
                 patched.setattr(storage, name, full(getattr(storage, name), count, at))
             code = main(["teach", "--use", "--json", *box])
         done, last = count[0] < at, json.loads(capsys.readouterr().out.splitlines()[-1])

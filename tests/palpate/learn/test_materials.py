@@ -312,6 +312,22 @@ def test_a_sweep_of_another_new_material_is_suspected(box):
 
 def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path):
     """Beside the delivered labels one material is enough; class bits count all."""
+
+    def sessions(folder: Path, codes: int) -> TeachingSession:
+        """A session with a bundle of oak and pine, into which cork was taught."""
+        from palpate.core.config import TeachConfig
+        from palpate.sweeps.recording import Labels, RecordingSession
+
+        def say(line: bytes) -> None:
+            pass
+
+        sweeps = folder / "sweeps"
+        recording = RecordingSession(sweeps, skin.FORMAT, Labels(), SystemClock(), say, 3)
+        base = ("oak", "pine", "cork")
+        return TeachingSession(
+            recording, TeachConfig(), lambda by: [], say, codes=codes, base=base, trained=base[:2]
+        )
+
     session: TeachingSession = sessions(tmp_path, codes=8)
     with pytest.raises(ConfigError, match="'oak'"):
         session.commands["TEACH"]("oak")
@@ -392,19 +408,3 @@ def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
             assert allowed or phase.about() == before
         for name, text in orders:
             assert phase.obey(command(name, text))
-
-
-def sessions(folder: Path, codes: int) -> TeachingSession:
-    """A session with a bundle of oak and pine, into which cork was taught."""
-    from palpate.core.config import TeachConfig
-    from palpate.sweeps.recording import Labels, RecordingSession
-
-    def say(line: bytes) -> None:
-        pass
-
-    sweeps = folder / "sweeps"
-    recording = RecordingSession(sweeps, skin.FORMAT, Labels(), SystemClock(), say, 3)
-    base = ("oak", "pine", "cork")
-    return TeachingSession(
-        recording, TeachConfig(), lambda by: [], say, codes=codes, base=base, trained=base[:2]
-    )

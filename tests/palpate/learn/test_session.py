@@ -211,20 +211,20 @@ def test_an_assessment_that_cannot_start_is_said(taught):
     assert "started" in taught.until(lambda about: about["trouble"])["trouble"]
 
 
-class HandClock(SystemClock):
-    """A clock that a test sets."""
-
-    t_ns = 0
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-
 @pytest.mark.parametrize(
     ("quiet_s", "why"), [(1e6, "not done within 300 s"), (200.0, "no further for 200 s")]
 )
 def test_a_process_that_hangs_is_killed(quiet_s, why):
     """With a reason and its children: after its limit or without a line."""
+
+    class HandClock(SystemClock):
+        """A clock that a test sets."""
+
+        t_ns = 0
+
+        def now_ns(self) -> int:
+            return self.t_ns
+
     code = (
         "import subprocess, sys, time\n"
         "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"

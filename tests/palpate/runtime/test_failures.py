@@ -64,28 +64,28 @@ def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
     assert (verdicts[0].detail, verdicts[0].label) == (str(error) or "MemoryError", "")
 
 
-class Rehearsing(FailingModel):
-    """Notes how many sweeps were answered at each rehearsal, which fails. took_ns: of an answer."""
-
-    def __init__(self, box: Rigged, took_ns: int) -> None:
-        super().__init__(box.box._answerer, lambda sweep: False, BAD_ALLOC)
-        self._box, self._took_ns, self.after = box.box, took_ns, []
-        box.box._answerer = self
-
-    def __call__(self, sweep: Sweep) -> Verdict:
-        return replace(self._answerer(sweep), latency_ns=self._took_ns)
-
-    def rehearse(self) -> None:
-        self._answerer.rehearse()
-        assert self._box._cutter.sweeping
-        self.after.append(self._box.answered)
-        raise self._error
-
-
 @pytest.mark.parametrize(("took_ms", "after"), [(2, {1, 2}), (20, set())])
 def test_quick_answers_are_rehearsed_while_a_sweep_may_end(rigged, took_ms, after):
     """From the second sweep on, a few times; a rehearsal that fails changes no answer. A slow model
     would cost frames."""
+
+    class Rehearsing(FailingModel):
+        """Notes how many sweeps were answered at each rehearsal, which fails."""
+
+        def __init__(self, box: Rigged, took_ns: int) -> None:
+            super().__init__(box.box._answerer, lambda sweep: False, BAD_ALLOC)
+            self._box, self._took_ns, self.after = box.box, took_ns, []
+            box.box._answerer = self
+
+        def __call__(self, sweep: Sweep) -> Verdict:
+            return replace(self._answerer(sweep), latency_ns=self._took_ns)
+
+        def rehearse(self) -> None:
+            self._answerer.rehearse()
+            assert self._box._cutter.sweeping
+            self.after.append(self._box.answered)
+            raise self._error
+
     plain, other = tubes(1, 3), tubes(1, 3)
     box = rigged(plain)
     want = box.until(lambda: plain.finished(box.box.answered))
@@ -109,27 +109,27 @@ def test_repeated_failures_end_the_program_once_all_are_answered(rigged):
     assert heard(box) == [(1, "failed"), (2, "failed"), (3, "failed")]
 
 
-def run_of(failures: np.ndarray, model: bundle.Bundle) -> int | None:
-    """The number of the sweep that ends a box whose model fails on these, None if none does."""
-    box = assembly.box(config.load(None, site=NO_SITE), model, tubes(1, 1), None, ExitStack())
-    verdict = Verdict(1, 0, Status.OK, "wood", 1, 1, np.ones(1), 1, 0, 0, "")
-
-    def answer(sweep: Sweep) -> Verdict:
-        if failures[sweep.id - 1]:
-            raise BAD_ALLOC
-        return verdict
-
-    answer.model = ""
-    box._answerer = answer
-    for number in range(1, len(failures) + 1):
-        box._classified(Sweep(number, 0, 0, Status.OK, np.empty(0)))
-        if box._failures >= FAILURES:
-            return number
-    return None
-
-
 def test_failures_far_apart_do_not_end_it(default_bundle):
     """A failure counts until SOUND sweeps were classified after it."""
+
+    def run_of(failures: np.ndarray, model: bundle.Bundle) -> int | None:
+        """The number of the sweep that ends a box whose model fails on these, None if none does."""
+        box = assembly.box(config.load(None, site=NO_SITE), model, tubes(1, 1), None, ExitStack())
+        verdict = Verdict(1, 0, Status.OK, "wood", 1, 1, np.ones(1), 1, 0, 0, "")
+
+        def answer(sweep: Sweep) -> Verdict:
+            if failures[sweep.id - 1]:
+                raise BAD_ALLOC
+            return verdict
+
+        answer.model = ""
+        box._answerer = answer
+        for number in range(1, len(failures) + 1):
+            box._classified(Sweep(number, 0, 0, Status.OK, np.empty(0)))
+            if box._failures >= FAILURES:
+                return number
+        return None
+
     numbers = np.arange(1, 100)
     assert run_of(numbers % (SOUND + 1) == 0, default_bundle) is None
     assert run_of(numbers % SOUND == 0, default_bundle) == SOUND * FAILURES
@@ -152,24 +152,24 @@ def test_early_heads_that_fail_leave_the_whole_sweep(rigged, logged):
     assert sum("answers" in line for line in logged) == 1
 
 
-class Breaking(Observer):
-    """An observer that raises in each of its methods."""
-
-    def __init__(self, error: Exception) -> None:
-        self._error = error
-
-    def turn(self, health: Health) -> None:
-        raise self._error
-
-    def answered(self, verdict: Verdict) -> None:
-        raise self._error
-
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: object) -> None:
-        raise self._error
-
-
 def test_a_fault_in_an_observer_costs_nothing_else(rigged, logged):
     """It is logged, the sweeps are answered, and the other observers are called."""
+
+    class Breaking(Observer):
+        """An observer that raises in each of its methods."""
+
+        def __init__(self, error: Exception) -> None:
+            self._error = error
+
+        def turn(self, health: Health) -> None:
+            raise self._error
+
+        def answered(self, verdict: Verdict) -> None:
+            raise self._error
+
+        def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: object) -> None:
+            raise self._error
+
     simulated = tubes(1, 3)
     box = rigged(simulated, observers=[Breaking(KeyError("none of these"))])
     box.until(lambda: simulated.finished(box.box.answered))

@@ -289,26 +289,26 @@ def test_a_box_without_a_port_logs_none(default_bundle, logged):
     assert not [line for line in logged if "serial" in line or " open" in line]
 
 
-class EffectLog(Observer):
-    """Logs its calls under its name."""
-
-    def __init__(self, name: str, effects: list[str]) -> None:
-        self._name, self._effects = name, effects
-
-    def answered(self, verdict: Verdict) -> None:
-        self._effects.append(f"{self._name} answered {verdict.sweep}")
-
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        self._effects.append(f"{self._name} sweep {sweep.id} {circumstances['source']}")
-
-    def turn(self, health: Health) -> None:
-        """Log the call if a sweep was answered in this turn."""
-        if self._effects and "turn" not in self._effects[-1]:
-            self._effects.append(f"{self._name} turn {health.answered}")
-
-
 def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged):
     """Health comes last."""
+
+    class EffectLog(Observer):
+        """Logs its calls under its name."""
+
+        def __init__(self, name: str, effects: list[str]) -> None:
+            self._name, self._effects = name, effects
+
+        def answered(self, verdict: Verdict) -> None:
+            self._effects.append(f"{self._name} answered {verdict.sweep}")
+
+        def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+            self._effects.append(f"{self._name} sweep {sweep.id} {circumstances['source']}")
+
+        def turn(self, health: Health) -> None:
+            """Log the call if a sweep was answered in this turn."""
+            if self._effects and "turn" not in self._effects[-1]:
+                self._effects.append(f"{self._name} turn {health.answered}")
+
     effects: list[str] = []
     box = rigged(quiet(), observers=[EffectLog("a", effects), EffectLog("b", effects), Observer()])
     box.seconds(0.5)

@@ -43,18 +43,18 @@ def swept(box: Rigged) -> str:
     return next(line for line in box.heard if ",RES," in line)
 
 
-class Circumstances(Observer):
-    """Keeps the circumstances of each sweep, which sidecars hold."""
-
-    def __init__(self) -> None:
-        self.kept: list[dict] = []
-
-    def sweep(self, sweep, verdict, circumstances) -> None:
-        self.kept.append(dict(circumstances))
-
-
 def test_it_is_said_everywhere(rigged, monkeypatch):
     """Field 14 of RES, 18 of STA, words; frames are used as usual."""
+
+    class Circumstances(Observer):
+        """Keeps the circumstances of each sweep, which sidecars hold."""
+
+        def __init__(self) -> None:
+            self.kept: list[dict] = []
+
+        def sweep(self, sweep, verdict, circumstances) -> None:
+            self.kept.append(dict(circumstances))
+
     observer = Circumstances()
     box, _ = on_a_matrix(rigged, monkeypatch, observers=[observer])
     fields = swept(box).rpartition("*")[0].split(",")[2:]

@@ -14,8 +14,6 @@ from palpate.service.last_failure import PAUSES_S, Failure
 from palpate.sim import gpio
 from palpate.sim.rig import VirtualClock
 
-SECOND = 1_000_000_000
-
 
 def failed(folder: Path, clock: VirtualClock, error: Exception) -> Failure:
     """The note of one more end by this error."""
@@ -28,13 +26,14 @@ def failed(folder: Path, clock: VirtualClock, error: Exception) -> Failure:
 
 def test_the_pause_grows_and_begins_anew(tmp_path):
     """Up to a limit; short after a minute's run or an order."""
+    second = 1_000_000_000
     clock = VirtualClock()
     pauses = []
     for _ in range(len(PAUSES_S) + 2):
         pauses.append(failed(tmp_path, clock, LineError("no chip")).pause_s)
-        clock.sleep_until(clock.now_ns() + 5 * SECOND)
+        clock.sleep_until(clock.now_ns() + 5 * second)
     assert pauses == [*PAUSES_S, PAUSES_S[-1], PAUSES_S[-1]]
-    clock.sleep_until(clock.now_ns() + 100 * SECOND)
+    clock.sleep_until(clock.now_ns() + 100 * second)
     assert failed(tmp_path, clock, LineError("no chip")).failures == 1
     with last_failure.recorded(tmp_path, clock):
         pass

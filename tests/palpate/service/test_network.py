@@ -13,7 +13,6 @@ from palpate.service import network
 from palpate.sim.rig import VirtualClock
 
 pytest.importorskip("zeroconf", reason="palpate[found] is not installed")
-LOOPBACK = ["127.0.0.1", "127.0.0.2"]
 
 
 @pytest.fixture
@@ -26,28 +25,27 @@ def open_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("open_loopback")
 def test_two_boxes_of_one_name(monkeypatch):
     """Each is found at its own address, with all that is open."""
+    kinds = (("page", 8137), ("opcua", 4840))
+    loopback = ["127.0.0.1", "127.0.0.2"]
     ends = []
-    for own, host in zip(("aaaaaa", "bbbbbb"), LOOPBACK, strict=True):
+    for own, host in zip(("aaaaaa", "bbbbbb"), loopback, strict=True):
         monkeypatch.setattr(network, "box_id", lambda own=own: own)
-        ends += [network.announce(kind, host, port, "line_3") for kind, port in KINDS]
+        ends += [network.announce(kind, host, port, "line_3") for kind, port in kinds]
     try:
         wanted = {
             network.Reachable(f"line-3-{own}", kind, host, port)
-            for own, host in zip(("aaaaaa", "bbbbbb"), LOOPBACK, strict=True)
-            for kind, port in KINDS
+            for own, host in zip(("aaaaaa", "bbbbbb"), loopback, strict=True)
+            for kind, port in kinds
         }
         found: set[network.Reachable] = set()
         for _ in range(10):
-            found = {*network.found(SystemClock(), LOOPBACK)}
+            found = {*network.found(SystemClock(), loopback)}
             if found >= wanted:
                 break
         assert {one for one in found if one.box.startswith("line-3-")} == wanted
     finally:
         for end in ends:
             end()
-
-
-KINDS = (("page", 8137), ("opcua", 4840))
 
 
 def test_the_id_is_stable_and_a_closed_box_says_nothing(monkeypatch):

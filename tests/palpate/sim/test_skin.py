@@ -25,15 +25,6 @@ def rng(seed: int = 3) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def centre(frames: np.ndarray) -> np.ndarray:
-    """Pressure centre (row, column) of frames [n, 4, 4]."""
-    load = frames.mean(0, dtype=float)
-    return (
-        np.array([(load.sum(1) * np.arange(4)).sum(), (load.sum(0) * np.arange(4)).sum()])
-        / load.sum()
-    )
-
-
 SHEAR = World(shear=True)
 
 
@@ -200,6 +191,15 @@ def test_the_springs_carry_the_force(kpa_per_mm):
 
 def test_the_pressure_centre_moves_against_the_skin():
     """If the end of the pad is near, in either direction."""
+
+    def centre(frames: np.ndarray) -> np.ndarray:
+        """Pressure centre (row, column) of frames [n, 4, 4]."""
+        load = frames.mean(0, dtype=float)
+        return (
+            np.array([(load.sum(1) * np.arange(4)).sum(), (load.sum(0) * np.arange(4)).sum()])
+            / load.sum()
+        )
+
     still = replace(skin.LEVEL_BLIND, off=only("position").off)
     middle = centre(skin.window("metal", Placement(), rng(), still))
     ahead = centre(skin.window("metal", Placement(dx_mm=1.0), rng(), still))

@@ -7,16 +7,16 @@ import re
 from palpate.sweeps.progress import RecordingProgress
 
 
-def counted(target: int, *pairs: tuple[str, str]) -> RecordingProgress:
-    """The progress after sweeps of these materials at these positions."""
-    progress = RecordingProgress(target)
-    for pair in pairs:
-        progress.add(*pair)
-    return progress
-
-
 def test_each_material_is_wanted_at_every_position():
     """Up to the target; removed pairs and no material do not count; long lists are cut."""
+
+    def counted(target: int, *pairs: tuple[str, str]) -> RecordingProgress:
+        """The progress after sweeps of these materials at these positions."""
+        progress = RecordingProgress(target)
+        for pair in pairs:
+            progress.add(*pair)
+        return progress
+
     progress = counted(2, *((material, "1") for material in "abcda"), ("a", "2"))
     found, missing = progress.line("a", "1").split("; missing: ")
     assert (found, len(missing.split(", "))) == ("a at 1: 2 of 2", 6)

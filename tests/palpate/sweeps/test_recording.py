@@ -95,15 +95,6 @@ def pairs(*numbers: int) -> list[str]:
     return sorted(f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy"))
 
 
-def refusing(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    """A disk on which no sweep can be stored."""
-
-    def refused(*args: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(sweep_folder, "save", refused)
-
-
 @pytest.fixture
 def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Recorded:
     """Builds boxes that record to `tmp_path`."""
@@ -119,14 +110,14 @@ def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Recorded:
     return make
 
 
-def heard(box: Rigged) -> list[list[str]]:
-    """The REC sentences that the robot has read: their fields after the kind."""
-    box.seconds(0.1)
-    return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
-
-
 def test_a_label_applies_to_sweeps_that_start_after_it(recorded, tmp_path):
     """On the serial line with real edges."""
+
+    def heard(box: Rigged) -> list[list[str]]:
+        """The REC sentences that the robot has read: their fields after the kind."""
+        box.seconds(0.1)
+        return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
+
     first, *others = script.tubes(1, 3)
     quiet = np.concatenate([np.zeros((3 * 750, 4, 4), np.uint8), first.frames])
     first = rig.Act(quiet, 3 * 750 + first.start, 3 * 750 + first.stop, "")
@@ -538,6 +529,15 @@ def test_no_room_for_the_system_stops_recording(
 )
 def test_a_disk_that_refuses(tmp_path, monkeypatch, code, outcome, logged):
     """No space and no quota are `full`, anything else is `failed`, with the reason."""
+
+    def refusing(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+        """A disk on which no sweep can be stored."""
+
+        def refused(*args: object) -> None:
+            raise OSError(code, os.strerror(code))
+
+        monkeypatch.setattr(sweep_folder, "save", refused)
+
     desk = Desk(tmp_path)
     refusing(monkeypatch, code)
     assert desk.sweep(1) == ["1", outcome, "0", "wood", "", "", os.strerror(code)]

@@ -170,32 +170,38 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
     assert answers(sure, teaching=False) == [good, refused, good, dead]
 
 
-class RecordingBox:
-    """A recording of a skin of two taxels, whose slides show no pattern."""
-
-    format = SweepFormat(1, 2, 100.0, 200, "uint8")
-
-    def __init__(self, folder: Path) -> None:
-        self.clock, self._rng, self._id = rig.VirtualClock(), np.random.default_rng(3), 0
-        self.session = RecordingSession(folder, self.format, Labels(), self.clock, lambda line: 0)
-        self.check = SweepCheck(self.format, self.clock, SlidesBefore(self.format, self.session))
-
-    def sweep(self, material: str, deviation: float = 12) -> Verdict:
-        """Record a sweep that vibrates so."""
-        self.session.commands["MATERIAL"](material)
-        counts = self._rng.normal(100, deviation, (200, 1, 2))
-        self._id += 1
-        sweep = replace(
-            sweep_of(np.rint(counts).astype(np.uint8)), id=self._id, start_ns=self.clock.now_ns()
-        )
-        verdict = self.check(sweep)
-        self.session.sweep(sweep, verdict, {})
-        return verdict
-
-
 def test_a_recording_compares_the_vibration_with_sweeps_before_of_the_material(tmp_path):
     """From the fourth on, the three before it too; until then it says that it does not. Sweeps of
     an earlier run count, discarded ones and other materials do not."""
+
+    class RecordingBox:
+        """A recording of a skin of two taxels, whose slides show no pattern."""
+
+        format = SweepFormat(1, 2, 100.0, 200, "uint8")
+
+        def __init__(self, folder: Path) -> None:
+            self.clock, self._rng, self._id = rig.VirtualClock(), np.random.default_rng(3), 0
+            self.session = RecordingSession(
+                folder, self.format, Labels(), self.clock, lambda line: 0
+            )
+            self.check = SweepCheck(
+                self.format, self.clock, SlidesBefore(self.format, self.session)
+            )
+
+        def sweep(self, material: str, deviation: float = 12) -> Verdict:
+            """Record a sweep that vibrates so."""
+            self.session.commands["MATERIAL"](material)
+            counts = self._rng.normal(100, deviation, (200, 1, 2))
+            self._id += 1
+            sweep = replace(
+                sweep_of(np.rint(counts).astype(np.uint8)),
+                id=self._id,
+                start_ns=self.clock.now_ns(),
+            )
+            verdict = self.check(sweep)
+            self.session.sweep(sweep, verdict, {})
+            return verdict
+
     box = RecordingBox(tmp_path)
     box.sweep("oak", 1)
     box.session.commands["DISCARD"]("")

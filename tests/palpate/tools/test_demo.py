@@ -81,23 +81,23 @@ def test_ctrl_c_ends_with_its_exit_code(number, code):
         assert run.wait(timeout=30) == code
 
 
-def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
-    """A set of three materials, one after the other: the name of its script."""
-    samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
-    np.savez(
-        folder / "s.npz",
-        samples=samples,
-        labels=np.repeat(np.arange(3), each),
-        materials=["a", "b", "c"],
-        rate_hz=bundle.format.rate_hz,
-        group_recording=np.repeat(np.arange(3), each),
-    )
-    return f"replay:{folder / 's.npz'}"
-
-
 @pytest.mark.parametrize(("each", "more"), [(4, []), (1, ["--sweeps", "50"])])
 def test_demo_of_a_set(each, more, tmp_path, default_bundle, capsys):
     """Each of three materials is shown once, also where the set ends before the sweeps."""
+
+    def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
+        """A set of three materials, one after the other: the name of its script."""
+        samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
+        np.savez(
+            folder / "s.npz",
+            samples=samples,
+            labels=np.repeat(np.arange(3), each),
+            materials=["a", "b", "c"],
+            rate_hz=bundle.format.rate_hz,
+            group_recording=np.repeat(np.arange(3), each),
+        )
+        return f"replay:{folder / 's.npz'}"
+
     which = ["--sim", played_set(tmp_path, default_bundle, each)]
     assert main(["demo", *VIRTUAL, *which, *more]) == 0
     out = capsys.readouterr().out

@@ -22,15 +22,6 @@ MARKED = SkinProfile("m", "s", codec="fixed", marker=b"\xaa\x55")
 SUMMED = replace(MARKED, checksum="crc8", trailer=b"\r\n", marker=b"")
 
 
-def stream(p: SkinProfile, n: int = 8) -> bytes:
-    """`n` frames of 4 x 4 uint8 with the marks and the checksum of `p`."""
-    made, check = b"", checksums.parsed(p.checksum)
-    for i in range(n):
-        frame = p.marker + bytes((3 * i + k) % 100 for k in range(16))
-        made += frame + (bytes([check.of(frame)]) if check else b"") + p.trailer
-    return made
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_the_frames_of_every_skin_are_shown_and_fit(name):
     """A stream that begins and ends within a frame: frames with their numbers, and no misfit."""
@@ -56,6 +47,15 @@ def test_the_frames_of_every_skin_are_shown_and_fit(name):
 )
 def test_the_byte_that_does_not_fit_is_in_brackets(p, change, at):
     """Offset and value of the first byte that is not as the profile says."""
+
+    def stream(p: SkinProfile, n: int = 8) -> bytes:
+        """`n` frames of 4 x 4 uint8 with the marks and the checksum of `p`."""
+        made, check = b"", checksums.parsed(p.checksum)
+        for i in range(n):
+            frame = p.marker + bytes((3 * i + k) % 100 for k in range(16))
+            made += frame + (bytes([check.of(frame)]) if check else b"") + p.trailer
+        return made
+
     sent = replace(p, cols=4, marker=MARKED.marker if p.marker else b"")
     data = change(stream(replace(sent, checksum="crc8" if p.checksum else "")))
     lines, good = skin_bytes.report(p, data)

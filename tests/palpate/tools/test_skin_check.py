@@ -165,23 +165,23 @@ FAULTS: dict[str, Fault] = {
     "stop: after STOP": of_requests(lambda b, n: n == 4 and b.due_ns() is not None),
 }
 """The part that must fail with what its line contains, and what is wrong."""
-DEPENDS = {
-    "format": PARTS,
-    "crc": PARTS,
-    "packets": ("rate", "clock"),
-    "sequence": ("start", *PARTS[4:]),
-    "loss": ("overflow",),
-    "rate": ("clock", "overflow"),
-    "clock": ("overflow",),
-    "start": PARTS,
-    "requests": PARTS[10:],
-}
-"""Parts that may fail with a part."""
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_fault_is_found(name):
     """The part fails with a remedy, and independent parts are ok."""
+    # Parts that may fail with a part
+    depends = {
+        "format": PARTS,
+        "crc": PARTS,
+        "packets": ("rate", "clock"),
+        "sequence": ("start", *PARTS[4:]),
+        "loss": ("overflow",),
+        "rate": ("clock", "overflow"),
+        "clock": ("overflow",),
+        "start": PARTS,
+        "requests": PARTS[10:],
+    }
     simulated = idle_devices(acm=True)
     FAULTS[name](simulated)
     part, _, words = name.partition(": ")
@@ -189,7 +189,7 @@ def test_each_fault_is_found(name):
     assert found[part].verdict == "FAIL", found
     assert words in found[part].detail
     failed = {n for n, f in found.items() if f.verdict == "FAIL"}
-    assert failed <= {part, *DEPENDS.get(part, ())}
+    assert failed <= {part, *depends.get(part, ())}
 
 
 @pytest.mark.parametrize("acm", [False, True])
@@ -239,33 +239,33 @@ def test_a_pulled_cable_ends_the_check_and_no_reply_is_found():
     assert "IDENTITY" in findings(simulated)["requests"].detail
 
 
-class EchoLink:
-    """A device that sends each byte back, as a terminal does; it never answers."""
-
-    def __init__(self) -> None:
-        self.clock, self.sent = rig.VirtualClock(), b""
-
-    def request(self, request: packets.Request, length: int) -> bytes:
-        """No reply."""
-        self.sent += bytes([request])
-        if length:
-            raise SensorMismatch(
-                f"the skin sends 1 other bytes but does not answer request {request.name}"
-            )
-        return b""
-
-    def read(self, size: int, timeout_ms: int) -> bytes:
-        """The echo."""
-        self.clock.sleep_until(self.clock.now_ns() + timeout_ms * 1_000_000)
-        data, self.sent = self.sent, b""
-        return data
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
 def test_another_device_at_the_port_is_told_apart():
     """Another device answers nothing and sends no packets: no part is ok, and the check ends."""
+
+    class EchoLink:
+        """A device that sends each byte back, as a terminal does; it never answers."""
+
+        def __init__(self) -> None:
+            self.clock, self.sent = rig.VirtualClock(), b""
+
+        def request(self, request: packets.Request, length: int) -> bytes:
+            """No reply."""
+            self.sent += bytes([request])
+            if length:
+                raise SensorMismatch(
+                    f"the skin sends 1 other bytes but does not answer request {request.name}"
+                )
+            return b""
+
+        def read(self, size: int, timeout_ms: int) -> bytes:
+            """The echo."""
+            self.clock.sleep_until(self.clock.now_ns() + timeout_ms * 1_000_000)
+            data, self.sent = self.sent, b""
+            return data
+
+        def close(self) -> None:
+            """Nothing is held."""
+
     link = EchoLink()
     found = {f.part: f for f in skin_check.check(link, link.clock, 5, port=True)}
     assert [found[part].verdict for part in ("identity", "format", "start")] == [

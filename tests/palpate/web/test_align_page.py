@@ -68,36 +68,34 @@ def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
         run.kill()
 
 
-TURN_S = 40
-"""Longest wait for one of the four touches, which are repeated every 16 s."""
-SHOWN = """() => {
-  const text = (id) => document.getElementById(id).innerText.replaceAll("\u00a0", " ");
-  const sight = (id) => document.getElementById(id)?.style.visibility;
-  return {
-    state: document.body.dataset.state, message: text("message"), hint: text("hint"),
-    skin: text("state"), simulated: document.getElementById("simulated").checkVisibility(),
-    trained: document.querySelectorAll("#align .trained").length, way: sight("way"),
-    centre: sight("centre"),
-    counts: [...document.querySelectorAll("#align .count")].map((e) => e.textContent),
-  };
-}"""
-"""The page at one moment: a finger comes and goes, so two looks may be of two states."""
-
-
-def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """The first moment of the page that is as wanted."""
-    shown: dict[str, Any] = {}
-
-    def look() -> bool:
-        shown.update(seen.page.evaluate(SHOWN))
-        return wanted(shown)
-
-    until(look, TURN_S)
-    return shown
-
-
 def test_the_whole_way(browser, box):
     """The real command: the page waits, advises, follows a touch; then "no connection"."""
+    # the page at one moment: a finger comes and goes, so two looks may be of two states
+    moment = """() => {
+      const text = (id) => document.getElementById(id).innerText.replaceAll("\u00a0", " ");
+      const sight = (id) => document.getElementById(id)?.style.visibility;
+      return {
+        state: document.body.dataset.state, message: text("message"), hint: text("hint"),
+        skin: text("state"), simulated: document.getElementById("simulated").checkVisibility(),
+        trained: document.querySelectorAll("#align .trained").length, way: sight("way"),
+        centre: sight("centre"),
+        counts: [...document.querySelectorAll("#align .count")].map((e) => e.textContent),
+      };
+    }"""
+    # Longest wait for one of the four touches, which are repeated every 16 s
+    turn_s = 40
+
+    def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The first moment of the page that is as wanted."""
+        shown: dict[str, Any] = {}
+
+        def look() -> bool:
+            shown.update(seen.page.evaluate(moment))
+            return wanted(shown)
+
+        until(look, turn_s)
+        return shown
+
     run, address = box
     seen = BrowsedPage(browser, address, (820, 1180))
     advice = re.compile(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1")
@@ -120,11 +118,29 @@ def test_the_whole_way(browser, box):
     assert run.wait(timeout=WAIT_S) in (0, 130)
     seen.state("no-connection")
     assert seen.text("#message") == "no connection"
-    assert {url.removeprefix(address).split("?")[0] for url in seen.requests} <= FILES
+    shared = ("old", "tablet", "statuses", "events", "parts", "skin", "plots", "start")
+    watched = ("verdict", "sweeps", "history", "watch")
+    files = {
+        "/",
+        "/page.css",
+        "/logo.svg",
+        "/events",
+        *(f"/{name}.js" for name in shared + watched),
+    }
+    assert {url.removeprefix(address).split("?")[0] for url in seen.requests} <= files
 
 
 def test_the_page_draws_what_the_box_says(browser, page):
     """Loads, points at their coordinates, and the message, also for screen readers."""
+
+    def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
+        """Centre and radius of each."""
+        return seen.page.eval_on_selector_all(
+            which,
+            "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r:"
+            " e.r.baseVal.value}))",
+        )
+
     seen = BrowsedPage(browser, page.address, (1180, 820))
     seen.state("off")
     assert seen.text("#message") == VIEW.message
@@ -162,32 +178,6 @@ def test_the_page_draws_what_the_box_says(browser, page):
     assert seen.errors == []
 
 
-def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
-    """Centre and radius of each."""
-    return seen.page.eval_on_selector_all(
-        which,
-        "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r:"
-        " e.r.baseVal.value}))",
-    )
-
-
-FILES = {"/", "/page.css", "/logo.svg", "/events"} | {
-    f"/{name}.js"
-    for name in [
-        "old",
-        "tablet",
-        "verdict",
-        "statuses",
-        "sweeps",
-        "history",
-        "start",
-        "watch",
-        "events",
-        "parts",
-        "skin",
-        "plots",
-    ]
-}
 FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
 
 
@@ -243,6 +233,18 @@ def test_every_count_can_be_read_on_its_taxel(browser, page, scheme):
 )
 def test_the_picture_shows_which_end_is_the_fingertip(browser, page, side, at):
     """A cap at that side; where it is not set, the page says how to find it out."""
+
+    def beyond(board: dict[str, float], box: dict[str, float]) -> str:
+        """The side of the skin beyond which the middle of a box lies."""
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        out = {
+            "left": board["x"] - x,
+            "right": x - board["x"] - board["width"],
+            "top": board["y"] - y,
+        }
+        out["bottom"] = y - board["y"] - board["height"]
+        return max(out, key=lambda side: out[side])
+
     seen = BrowsedPage(browser, page.address, (1024, 768))
     seen.state("off")
     assert seen.page.locator(".finger").count() == 0
@@ -255,14 +257,6 @@ def test_the_picture_shows_which_end_is_the_fingertip(browser, page, side, at):
     assert beyond(board, name) == at
     assert min(name["x"], name["y"]) >= 0
     assert not seen.page.is_visible("#where")
-
-
-def beyond(board: dict[str, float], box: dict[str, float]) -> str:
-    """The side of the skin beyond which the middle of a box lies."""
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    out = {"left": board["x"] - x, "right": x - board["x"] - board["width"], "top": board["y"] - y}
-    out["bottom"] = y - board["y"] - board["height"]
-    return max(out, key=lambda side: out[side])
 
 
 def test_a_box_that_says_nothing_new_is_no_news(browser, page):
@@ -281,6 +275,12 @@ def test_a_box_that_says_nothing_new_is_no_news(browser, page):
 )
 def test_it_fits_phone_tablet_and_desktop(browser, page, width, height, scheme):
     """All on one screen without scrolling, light and dark, with enough contrast."""
+
+    def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
+        """A colour of an element, as red, green and blue."""
+        text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{name}")
+        return [float(part) for part in re.findall(r"\d+", text)[:3]]
+
     longest = "12.5 mm too far towards column 4 and 10.5 mm towards row 4"
     page.show(replace(VIEW, message=longest, source="sim"))
     seen = BrowsedPage(browser, page.address, (width, height), scheme)
@@ -296,9 +296,3 @@ def test_it_fits_phone_tablet_and_desktop(browser, page, width, height, scheme):
         assert box["x"] + box["width"] <= width
         assert contrast(style(seen, what, "color"), style(seen, "body", "backgroundColor")) >= 4.5
     assert (luminance(style(seen, "body", "backgroundColor")) > 0.5) == (scheme == "light")
-
-
-def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
-    """A colour of an element, as red, green and blue."""
-    text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{name}")
-    return [float(part) for part in re.findall(r"\d+", text)[:3]]

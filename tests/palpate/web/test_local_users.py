@@ -22,22 +22,6 @@ def page() -> Iterator[PageServer]:
         yield made
 
 
-def port(page: PageServer) -> int:
-    """The port of a page."""
-    return int(page.address.rpartition(":")[2])
-
-
-def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
-    """The answer to a request for the page. host: address of the client."""
-    asked = HTTPConnection("127.0.0.1", port(page), timeout=60, source_address=(host, 0))
-    try:
-        asked.request("GET", "/")
-        answer = asked.getresponse()
-        return answer.status, answer.reason
-    finally:
-        asked.close()
-
-
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_owner_of_a_connection(host):
     """This user for both families, and nobody for a connection that is not there."""
@@ -53,6 +37,21 @@ def test_the_owner_of_a_connection(host):
 
 def test_another_user_gets_nothing(page, monkeypatch):
     """Root and this user see the box; the answer to others names the group."""
+
+    def port(page: PageServer) -> int:
+        """The port of a page."""
+        return int(page.address.rpartition(":")[2])
+
+    def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
+        """The answer to a request for the page. host: address of the client."""
+        asked = HTTPConnection("127.0.0.1", port(page), timeout=60, source_address=(host, 0))
+        try:
+            asked.request("GET", "/")
+            answer = asked.getresponse()
+            return answer.status, answer.reason
+        finally:
+            asked.close()
+
     assert local_users.may_see(0)
     assert local_users.may_see(os.geteuid())
     assert not local_users.may_see(None)

@@ -61,18 +61,18 @@ def test_a_path_of_its_own(browser, tmp_path):
         assert not seen.errors
 
 
-def received(one: socket.socket, wanted: bytes) -> bytes:
-    """What comes, up to and with `wanted`."""
-    found = b""
-    while wanted not in found:
-        more = one.recv(4096)
-        assert more
-        found += more
-    return found
-
-
 def test_an_event_is_not_kept_until_there_are_more(tmp_path):
     """Fewer bytes than nginx keeps by itself arrive at once."""
+
+    def received(one: socket.socket, wanted: bytes) -> bytes:
+        """What comes, up to and with `wanted`."""
+        found = b""
+        while wanted not in found:
+            more = one.recv(4096)
+            assert more
+            found += more
+        return found
+
     with (
         Shown(Access(0)) as shown,
         proxy(tmp_path, "/", port_of(shown)) as port,

@@ -219,16 +219,16 @@ REFUSED: list[tuple[int, dict[str, str | None]]] = [
 ]
 
 
-class Obedient(RecordedPage):
-    """Notes each command, and does nothing."""
-
-    def obey(self, command: Command) -> Reply:
-        self.done.append(command.line)
-        return []
-
-
 def test_a_role_has_its_orders_and_those_of_the_roles_before(tmp_path):
     """A refused one does not reach the loop."""
+
+    class Obedient(RecordedPage):
+        """Notes each command, and does nothing."""
+
+        def obey(self, command: Command) -> Reply:
+            self.done.append(command.line)
+            return []
+
     tokens = tuple(f"{role}0123456789abcdef" for role in ROLES)
     with Obedient(tmp_path, Labels(), access=Access(0, tokens=tokens), teaching=True) as one:
         for asked, codes in (("START", (409, 200, 200)), ("USE", (409, 409, 200))):

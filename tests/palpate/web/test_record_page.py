@@ -364,26 +364,25 @@ def test_the_bar_shows_the_steps_and_the_time_of_use(browser: Any, tmp_path: Pat
         assert not seen.errors
 
 
-COVERED = """() => {
-  const seen = [...document.querySelectorAll("button, input, h2, #what, #now, #call")]
-    .filter((e) => e.checkVisibility()).map((e) => [e, e.getBoundingClientRect()]);
-  const meet = (p, q) => Math.min(p.right, q.right) - Math.max(p.left, q.left) > 1
-    && Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top) > 1;
-  return seen.flatMap(([a, p], i) => seen.slice(i + 1).filter(([, q]) => meet(p, q))
-    .map(([b]) => `${a.id} on ${b.id}`));
-}"""
-"""Pairs of controls and titles that lie on each other."""
-SMALL = """() => [...document.querySelectorAll("button, input")].filter((e) => e.checkVisibility())
-  .filter((e) => e.getBoundingClientRect().height < 40).map((e) => e.id)"""
-"""Controls that a finger misses."""
-
-
 @LOOKS
 @pytest.mark.parametrize("teaching", [False, True])
 def test_a_person_sees_each_control_of_a_page(
     browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
 ):
     """Nothing is covered, cut, too faint or too small."""
+    # Controls that a finger misses
+    small = """() => [...document.querySelectorAll("button, input")]
+      .filter((e) => e.checkVisibility() && e.getBoundingClientRect().height < 40)
+      .map((e) => e.id)"""
+    # Pairs of controls and titles that lie on each other
+    covered = """() => {
+      const seen = [...document.querySelectorAll("button, input, h2, #what, #now, #call")]
+        .filter((e) => e.checkVisibility()).map((e) => [e, e.getBoundingClientRect()]);
+      const meet = (p, q) => Math.min(p.right, q.right) - Math.max(p.left, q.left) > 1
+        && Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top) > 1;
+      return seen.flatMap(([a, p], i) => seen.slice(i + 1).filter(([, q]) => meet(p, q))
+        .map(([b]) => `${a.id} on ${b.id}`));
+    }"""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
         number = one.sweep()
         suspect = {"sweep": f"sweep-{number:06d}", "looks_like": "wood", "text": "like wood"}
@@ -396,8 +395,8 @@ def test_a_person_sees_each_control_of_a_page(
             one.recording.commands[order[0]](order[1])
         for where in ("#move", "#undo", "#rename"):
             until(lambda where=where: seen.page.is_visible(where))
-        assert seen.page.evaluate(COVERED) == []
-        assert seen.page.evaluate(SMALL) == []
+        assert seen.page.evaluate(covered) == []
+        assert seen.page.evaluate(small) == []
         assert seen.page.evaluate(CUT) == []
         assert seen.legibility()[1] == []
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= width

@@ -160,21 +160,19 @@ def test_the_page_for_this_machine_and_no_more(page, asked, answer):
     assert status(ask(page)) == 200
 
 
-YOUNG = re.compile(
-    r"\w\.at\(|\?\?=|\|\|=|&&=|\.replaceChildren\(|replaceAll|AbortSignal\.timeout|findLast|hasOwn\b"
-    r"|structuredClone|toSorted|toReversed|Promise\.any|checkVisibility"
-)
-"""What scripts of Chromium 83 and Safari 14 lack."""
-ABSOLUTE = re.compile(r"""(?:from|fetch\(|EventSource\(|href=|src=|replace\() ?["'`]/""")
-
-
 def test_pages_run_in_browsers_of_2020_behind_any_path():
     """No younger script, and relative addresses."""
+    absolute = re.compile(r"""(?:from|fetch\(|EventSource\(|href=|src=|replace\() ?["'`]/""")
+    # What scripts of Chromium 83 and Safari 14 lack
+    young = re.compile(
+        r"\w\.at\(|\?\?=|\|\|=|&&=|\.replaceChildren\(|replaceAll|AbortSignal\.timeout|findLast|hasOwn\b"
+        r"|structuredClone|toSorted|toReversed|Promise\.any|checkVisibility"
+    )
     found = {f.name: f.read_text() for f in server.FOLDER.iterdir()}
     assert len(found) > 15
     for name, text in found.items():
-        assert not (name.endswith(".js") and YOUNG.search(text)), name
-        assert not ABSOLUTE.search(text), name
+        assert not (name.endswith(".js") and young.search(text)), name
+        assert not absolute.search(text), name
 
 
 @pytest.mark.parametrize(

@@ -66,15 +66,13 @@ def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser, page
 @LOOKS
 def test_nothing_is_cut_off(browser, page, width, height, scheme):
     """No wider than the screen; counts have a contrast of 4.5 at least (WCAG 2.1, 1.4.3)."""
+    colours = "all => all.map(e => getComputedStyle(e).%s.match(/\\d+/g).slice(0, 3).map(Number))"
     seen = BrowsedPage(browser, page.address, (width, height), scheme)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
     tiles, counts = (
-        seen.page.eval_on_selector_all(".taxel", COLOURS % which)
+        seen.page.eval_on_selector_all(".taxel", colours % which)
         for which in ("backgroundColor", "color")
     )
     assert len(tiles) == 36
     assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5
-
-
-COLOURS = "all => all.map(e => getComputedStyle(e).%s.match(/\\d+/g).slice(0, 3).map(Number))"

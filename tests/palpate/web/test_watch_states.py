@@ -67,52 +67,47 @@ STATES: list[tuple[Callable[[Shown], None], str, str, str, str]] = [
 """What happens; tone and status of the card; its words and its advice, or how that begins."""
 
 
-BACK = "getComputedStyle(document.querySelector('#verdict')).backgroundColor"
-
-
-def shows(seen: BrowsedPage, tone: str, status: str, words: str, advice: str) -> None:
-    """The card comes to show this."""
-    until(lambda: seen.text("#label") == words and seen.text("#status") == status)
-    assert seen.page.get_attribute("#verdict", "data-tone") == tone
-    assert (seen.text("#advice") if advice else "").startswith(advice)
-
-
-OVERLAPS = """() => {
-  const parts = [...document.querySelectorAll("#verdict > *")].filter((e) => e.checkVisibility());
-  const inner = (e) => [e, ...e.querySelectorAll("svg, span")].map((one) => one.getBoundingClientRect());
-  const ends = parts.map((e) => Math.max(...inner(e).map((box) => box.bottom)));
-  const below = parts.filter((e, i) => i && e.getBoundingClientRect().top < ends[i - 1] - 1);
-  const end = document.querySelector("#verdict").getBoundingClientRect().bottom;
-  return [...below, ...parts.filter((e, i) => ends[i] > end)].map((e) => e.id);
-}"""  # noqa: E501
-"""Parts of the card that lie on the part above, or beyond the card's end."""
-
-
-def fits(seen: BrowsedPage, width: int, height: int) -> None:
-    """The card is in sight without scrolling, its words are large enough and whole."""
-    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
-    size = "e => parseFloat(getComputedStyle(e).fontSize)"
-    label, advice = seen.page.locator("#label"), seen.page.locator("#advice")
-    assert label.evaluate(size) >= (48 if width > 400 else 36)
-    if advice.is_visible():
-        assert advice.evaluate(size) >= 22
-        assert advice.bounding_box()["y"] + advice.bounding_box()["height"] <= height
-    assert seen.page.evaluate(OVERLAPS) == []
-    cut = "e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)"
-    assert label.evaluate(cut) <= 12  # the descent of letters with a line height of 1
-    assert label.evaluate("e => e.scrollWidth - e.clientWidth") <= 1
-
-
 @LOOKS
 def test_each_state_is_told_from_two_metres(browser, shown, width, height, scheme):
     """By colour, shape and word, with what to do, readable."""
+    # Parts of the card that lie on the part above, or beyond the card's end
+    overlaps = """() => {
+      const parts = [...document.querySelectorAll("#verdict > *")].filter((e) => e.checkVisibility());
+      const inner = (e) => [e, ...e.querySelectorAll("svg, span")].map((one) => one.getBoundingClientRect());
+      const ends = parts.map((e) => Math.max(...inner(e).map((box) => box.bottom)));
+      const below = parts.filter((e, i) => i && e.getBoundingClientRect().top < ends[i - 1] - 1);
+      const end = document.querySelector("#verdict").getBoundingClientRect().bottom;
+      return [...below, ...parts.filter((e, i) => ends[i] > end)].map((e) => e.id);
+    }"""  # noqa: E501
+
+    def fits(seen: BrowsedPage, width: int, height: int) -> None:
+        """The card is in sight without scrolling, its words are large enough and whole."""
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+        size = "e => parseFloat(getComputedStyle(e).fontSize)"
+        label, advice = seen.page.locator("#label"), seen.page.locator("#advice")
+        assert label.evaluate(size) >= (48 if width > 400 else 36)
+        if advice.is_visible():
+            assert advice.evaluate(size) >= 22
+            assert advice.bounding_box()["y"] + advice.bounding_box()["height"] <= height
+        assert seen.page.evaluate(overlaps) == []
+        cut = "e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)"
+        assert label.evaluate(cut) <= 12  # the descent of letters with a line height of 1
+        assert label.evaluate("e => e.scrollWidth - e.clientWidth") <= 1
+
+    def shows(seen: BrowsedPage, tone: str, status: str, words: str, advice: str) -> None:
+        """The card comes to show this."""
+        until(lambda: seen.text("#label") == words and seen.text("#status") == status)
+        assert seen.page.get_attribute("#verdict", "data-tone") == tone
+        assert (seen.text("#advice") if advice else "").startswith(advice)
+
+    back = "getComputedStyle(document.querySelector('#verdict')).backgroundColor"
     seen = BrowsedPage(browser, shown.server.address + "/#watch", (width, height), scheme)
     until(lambda: seen.page.locator(".row").count() == 40)
     looks = {tone: set() for tone in ("good", "warn", "bad", "away", "plain")}
     for act, *told in STATES:
         act(shown)
         shows(seen, *told)
-        looks[told[0]].add((seen.page.evaluate(BACK), seen.page.get_attribute("#sign path", "d")))
+        looks[told[0]].add((seen.page.evaluate(back), seen.page.get_attribute("#sign path", "d")))
         for _ in ("on", "off"):
             assert seen.legibility()[1] == []
             fits(seen, width, height)
@@ -171,25 +166,24 @@ def test_the_whole_screen_has_the_verdict_alone(browser, shown):
     until(lambda: seen.page.is_visible("#latest"))
 
 
-DEVICE = """() => {
-  window.locks = 0; window.tones = [];
-  const lock = () => Object.assign(new EventTarget(), {released: false});
-  Object.defineProperty(navigator, "wakeLock", {value: {request: async () => { window.locks += 1; return window.lock = lock(); }}});
-  window.AudioContext = class {
-    currentTime = 0;
-    createOscillator() {
-      const frequency = {};
-      return {frequency, connect() {}, start() { window.tones.push(frequency.value); }, stop() {}};
-    }
-    resume() {}
-  };
-}"""  # noqa: E501
-"""A tablet that notes how often its screen is kept on, and its tones in Hz."""
-
-
 def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser, shown):
     """The screen is kept on; if wanted, a refusal sounds once, an answer not."""
-    device = lambda context: context.add_init_script(f"({DEVICE})()")  # noqa: E731
+    # notes how often its screen is kept on, and its tones in Hz
+    tablet = """() => {
+      window.locks = 0; window.tones = [];
+      const lock = () => Object.assign(new EventTarget(), {released: false});
+      const request = async () => { window.locks += 1; return window.lock = lock(); };
+      Object.defineProperty(navigator, "wakeLock", {value: {request}});
+      window.AudioContext = class {
+        currentTime = 0;
+        createOscillator() {
+          const frequency = {}, start = () => { window.tones.push(frequency.value); };
+          return {frequency, connect() {}, start, stop() {}};
+        }
+        resume() {}
+      };
+    }"""
+    device = lambda context: context.add_init_script(f"({tablet})()")  # noqa: E731
     seen = BrowsedPage(browser, shown.server.address + "/#watch", prepare=device)
     until(lambda: seen.page.locator(".row").count() == 40)
     until(lambda: seen.page.evaluate("window.locks") == 1)

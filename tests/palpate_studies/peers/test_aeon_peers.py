@@ -23,18 +23,18 @@ def train(name: str, sweeps: Dataset, seed: int = 1) -> aeon_peers.AeonModel:
     return methods.find([name])[0].train(sweeps, sweeps.samples, seed)
 
 
-def hard(n: int = 12) -> Dataset:
-    """Noisy sweeps, so that answers differ."""
-    sweeps = easy(n)
-    noise = np.random.default_rng(1).normal(0, 25, sweeps.samples.shape)
-    return replace(sweeps, samples=(sweeps.samples + noise).astype(np.float32))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("materials", [3, 2])
 @names
 def test_the_labels_are_aeons(name: str, materials: int):
     """aeon's classifier with default settings and this seed, also on hard sweeps."""
+
+    def hard(n: int = 12) -> Dataset:
+        """Noisy sweeps, so that answers differ."""
+        sweeps = easy(n)
+        noise = np.random.default_rng(1).normal(0, 25, sweeps.samples.shape)
+        return replace(sweeps, samples=(sweeps.samples + noise).astype(np.float32))
+
     rockets = pytest.importorskip("aeon.classification.convolution_based")
     from aeon.classification.interval_based import QUANTClassifier
 

@@ -20,7 +20,6 @@ baselines = Later("palpate_studies.peers.baselines")
 pipeline = Later("sklearn.pipeline")
 preprocessing = Later("sklearn.preprocessing")
 special = Later("scipy.special")
-stats = Later("scipy.stats")
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +72,7 @@ def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
 
 def test_gauss_is_a_normal_distribution():
     """scipy's likelihoods, without covariances or features; finite with one sweep."""
+    stats = Later("scipy.stats")
     rng = np.random.default_rng(1)
     y = np.repeat([0, 1, 2], 20)
     x = rng.normal(0, 1, (60, 3)) @ rng.normal(0, 1, (3, 3)) * [1, 30, 5] + y[:, None] + [5, 100, 9]

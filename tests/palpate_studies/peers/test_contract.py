@@ -20,7 +20,6 @@ from tests.factories.later import Later
 from tests.factories.sheared import sheared
 from tests.factories.sweep_sets import easy
 
-torch = Later("torch")
 aeon_peers = Later("palpate_studies.peers.aeon_peers")
 minirocket = Later("palpate_studies.peers.minirocket")
 sthmp = Later("palpate_studies.peers.sthmp")
@@ -116,6 +115,7 @@ def test_silence_and_saturation_get_finite_logits(name: str):
 @pytest.mark.slow
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
     """Global random states stay; another seed gives another network."""
+    torch = Later("torch")
     sweeps = long(6)
     np.random.seed(4)
     before, torch_before = np.random.get_state()[1].copy(), torch.get_rng_state()

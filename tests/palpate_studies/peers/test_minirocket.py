@@ -16,7 +16,6 @@ from palpate_train.onnx_tools import graph_builder
 from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
 
-linear_head = Later("palpate_studies.peers.linear_head")
 minirocket = Later("palpate_studies.peers.minirocket")
 
 KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32": (16, 1, 33)}
@@ -45,25 +44,26 @@ def parameters(window: int, taxels: int) -> tuple[np.ndarray, ...]:
     return counts, chosen, dilations, per_kernel, rng.integers(-40, 40, 84 * per_kernel.sum()) + 0.5
 
 
-def by_definition(sweep: np.ndarray, found: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Dempster et al. 2021, frame by frame: shares above each bias, of counts [T, R, C]."""
-    counts, chosen, dilations, per_kernel, biases = found
-    x = sweep.reshape(len(sweep), -1).astype(np.float64)
-    taxels, left, shares = iter(np.split(chosen, np.cumsum(counts)[:-1])), iter(biases), []
-    for i, (dilation, n) in enumerate(zip(dilations, per_kernel, strict=True)):
-        for k, two in enumerate(combinations(range(9), 3)):
-            series = np.pad(x[:, next(taxels)].sum(axis=1), 4 * dilation)
-            out = sum(
-                (2 if tap in two else -1) * series[tap * dilation :][: len(x)] for tap in range(9)
-            )
-            out = out if (i + k) % 2 == 0 else out[4 * dilation : len(x) - 4 * dilation]
-            shares += [np.mean(out > next(left)) for _ in range(n)]
-    return np.array(shares)
-
-
 @pytest.mark.parametrize("dtype", KINDS)
 def test_the_graph_is_the_definition(dtype: str):
     """Kernels, dilations, sums, alternating padding, shares: any grid, type and length."""
+
+    def by_definition(sweep: np.ndarray, found: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Dempster et al. 2021, frame by frame: shares above each bias, of counts [T, R, C]."""
+        counts, chosen, dilations, per_kernel, biases = found
+        x = sweep.reshape(len(sweep), -1).astype(np.float64)
+        taxels, left, shares = iter(np.split(chosen, np.cumsum(counts)[:-1])), iter(biases), []
+        for i, (dilation, n) in enumerate(zip(dilations, per_kernel, strict=True)):
+            for k, two in enumerate(combinations(range(9), 3)):
+                series = np.pad(x[:, next(taxels)].sum(axis=1), 4 * dilation)
+                out = sum(
+                    (2 if tap in two else -1) * series[tap * dilation :][: len(x)]
+                    for tap in range(9)
+                )
+                out = out if (i + k) % 2 == 0 else out[4 * dilation : len(x) - 4 * dilation]
+                shares += [np.mean(out > next(left)) for _ in range(n)]
+        return np.array(shares)
+
     sweep, (rows, cols, window) = raw_counts(dtype)[0], KINDS[dtype]
     found = parameters(window, rows * cols)
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), found)
@@ -115,14 +115,15 @@ def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(logits.argmax(1), want)
 
 
-def head(sweeps: Dataset) -> graph_builder.GraphModel:
-    """A ridge on made-up features, which need no aeon."""
-    graph = minirocket.transform(sweeps.format, parameters(sweeps.format.window, 4))
-    return linear_head.train_linear_head(graph, minirocket._ridge, sweeps, sweeps.samples, 0)
-
-
 def test_the_temperature_comes_from_held_out_groups():
     """The first head misses recordings, the second none; random labels are uncertain."""
+    linear_head = Later("palpate_studies.peers.linear_head")
+
+    def head(sweeps: Dataset) -> graph_builder.GraphModel:
+        """A ridge on made-up features, which need no aeon."""
+        graph = minirocket.transform(sweeps.format, parameters(sweeps.format.window, 4))
+        return linear_head.train_linear_head(graph, minirocket._ridge, sweeps, sweeps.samples, 0)
+
     seen: list[np.ndarray] = []
 
     def spy(features: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,13 +25,10 @@ from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
 
 torch = Later("torch")
-ds_cnn = Later("palpate_studies.peers.ds_cnn")
-edge_spectral = Later("palpate_studies.peers.edge_spectral")
 lite = Later("palpate_studies.peers.lite")
 networks = Later("palpate_studies.peers.networks")
 paper_cnn = Later("palpate_studies.peers.paper_cnn")
 recurrent = Later("palpate_studies.peers.recurrent")
-training = Later("palpate_train.models.training")
 
 pytestmark = pytest.mark.slow
 
@@ -111,6 +108,7 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
 @pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
     """Step by step PyTorch's Adam: batches of a set that is shuffled for each round."""
+    training = Later("palpate_train.models.training")
     s, r = (
         made((6, 12, 2, 1), "float32", 2),
         replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0),
@@ -199,6 +197,8 @@ def test_probabilities_come_from_what_was_held_out():
 
 def test_effort_is_kept():
     """Names and iterations follow the effort; methods can be sent to another process."""
+    edge_spectral = Later("palpate_studies.peers.edge_spectral")
+    ds_cnn = Later("palpate_studies.peers.ds_cnn")
     peers = paper_cnn, recurrent, ds_cnn, lite, edge_spectral
     networks = [one for peer in peers for one in peer.methods()]
     assert tuple(m.name for m in networks) == NETS

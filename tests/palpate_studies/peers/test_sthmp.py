@@ -9,7 +9,6 @@ from palpate.core.types import SweepFormat
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.later import Later
 
-linear_model = Later("sklearn.linear_model")
 sthmp = Later("palpate_studies.peers.sthmp")
 
 SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32": (16, 1, 128)}
@@ -36,6 +35,7 @@ def atoms(n: int, rows: int = 2, cols: int = 2, frames: int = 12) -> np.ndarray:
 
 def test_the_codes_are_those_of_orthogonal_matching_pursuit():
     """Each patch gets the four atoms, and the amounts of them, that scikit-learn finds."""
+    linear_model = Later("sklearn.linear_model")
     x, d = patches(50), atoms(40)
     codes = sthmp.encode(x, d)
     want = linear_model.orthogonal_mp(
@@ -55,46 +55,52 @@ def test_a_patch_of_fewer_atoms_stays_so():
     np.testing.assert_allclose(sthmp.encode(2 * d[:1], d[:1]), [[2]], rtol=0, atol=1e-3)
 
 
-def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
-    """The features of counts [T, R, C], cell by cell."""
-    frames, height, width = d.shape[1:]
-    steps = range(0, len(sweep) - frames + 1, sthmp.STEP)
-    rows, cols = sweep.shape[1] - height + 1, sweep.shape[2] - width + 1
-    cut = [
-        sweep[t : t + frames, r : r + height, c : c + width]
-        for t in steps
-        for r in range(rows)
-        for c in range(cols)
-    ]
-    x = np.array(cut, np.float64) * scale
-    codes = sthmp.encode(x - x.mean(axis=1, keepdims=True), d).reshape(len(steps), rows, cols, -1)
-
-    def halves(n: int) -> list[slice]:
-        return [slice(0, n), slice(0, (n + 1) // 2), slice(n // 2, n)] if n > 1 else [slice(0, 1)]
-
-    spaces = [
-        (r, c) for r in halves(rows)[1:] or halves(rows) for c in halves(cols)[1:] or halves(cols)
-    ]
-    spaces = ([(slice(0, rows), slice(0, cols))] if rows * cols > 1 else []) + spaces
-    found = []
-    for level in (1, 2, 4):
-        for i in range(level):
-            first, last = (
-                int(np.floor(i * len(steps) / level)),
-                int(np.ceil((i + 1) * len(steps) / level)),
-            )
-            for r, c in spaces:
-                cell = codes[first:last, r, c].reshape(-1, len(d))
-                pair = np.maximum(np.concatenate([cell.max(0), -cell.min(0)]), 0)
-                found.append(pair / np.sqrt(pair @ pair + 0.1))
-        if len(steps) < 2 * level:
-            break
-    return np.concatenate(found)
-
-
 @pytest.mark.parametrize("dtype", SETS)
 def test_the_features_are_largest_codes_of_each_cell(dtype: str):
     """Over the grid and its quarters, the window and its parts; any grid, signs apart."""
+
+    def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
+        """The features of counts [T, R, C], cell by cell."""
+        frames, height, width = d.shape[1:]
+        steps = range(0, len(sweep) - frames + 1, sthmp.STEP)
+        rows, cols = sweep.shape[1] - height + 1, sweep.shape[2] - width + 1
+        cut = [
+            sweep[t : t + frames, r : r + height, c : c + width]
+            for t in steps
+            for r in range(rows)
+            for c in range(cols)
+        ]
+        x = np.array(cut, np.float64) * scale
+        codes = sthmp.encode(x - x.mean(axis=1, keepdims=True), d).reshape(
+            len(steps), rows, cols, -1
+        )
+
+        def halves(n: int) -> list[slice]:
+            return (
+                [slice(0, n), slice(0, (n + 1) // 2), slice(n // 2, n)] if n > 1 else [slice(0, 1)]
+            )
+
+        spaces = [
+            (r, c)
+            for r in halves(rows)[1:] or halves(rows)
+            for c in halves(cols)[1:] or halves(cols)
+        ]
+        spaces = ([(slice(0, rows), slice(0, cols))] if rows * cols > 1 else []) + spaces
+        found = []
+        for level in (1, 2, 4):
+            for i in range(level):
+                first, last = (
+                    int(np.floor(i * len(steps) / level)),
+                    int(np.ceil((i + 1) * len(steps) / level)),
+                )
+                for r, c in spaces:
+                    cell = codes[first:last, r, c].reshape(-1, len(d))
+                    pair = np.maximum(np.concatenate([cell.max(0), -cell.min(0)]), 0)
+                    found.append(pair / np.sqrt(pair @ pair + 0.1))
+            if len(steps) < 2 * level:
+                break
+        return np.concatenate(found)
+
     rows, cols, window = SETS[dtype]
     sweep = (120 + 9 * np.random.default_rng(2).standard_normal((window, rows, cols))).astype(dtype)
     d = atoms(7, min(rows, 2), min(cols, 2))

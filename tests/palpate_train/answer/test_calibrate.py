@@ -18,9 +18,6 @@ from palpate_train.models.recipe.fitted import ONE_IN, calibration_inputs
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.sweep_sets import easy
 
-NOISE = np.array([0.0, 0.0, 0.0, 12.0])
-"""The fault: noise in the last feature, in which materials do not differ."""
-
 
 def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features [N, 10, 4] of three materials at eight places, labels [N], places [N]."""
@@ -36,18 +33,20 @@ def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_a_disturbed_sweep_of_a_known_material_stays_known():
     """After copies of one in ten with the fault, other such sweeps are known; the rest stays."""
+    # The fault: noise in the last feature, in which materials do not differ
+    noise = np.array([0.0, 0.0, 0.0, 12.0])
     x, y, at = world()
     known = y < 2
     one = np.arange(known.sum()) % ONE_IN == 0
     factors = np.random.default_rng(2).uniform(-1, 1, (one.sum(), 1, 1))
     more = [np.concatenate([of[known], of[known][one]]) for of in (x, y, at)]
-    more[0][known.sum() :] += factors * NOISE
+    more[0][known.sum() :] += factors * noise
     faulty = np.arange(len(more[0])) >= known.sum()
     plain = fit_calibration(
         plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
     )
     sturdy = fit_calibration(plain_inputs(*more, ~faulty, 1, faulty=faulty))
-    shaken = x[known][:, -1] + NOISE / 2
+    shaken = x[known][:, -1] + noise / 2
     kept = [
         np.mean(done.embedding.novelty(shaken) <= done.limits.loose) for done in (plain, sturdy)
     ]

@@ -9,7 +9,6 @@ from palpate_train.metrics import tolerances
 from tests.factories.later import Later
 
 discriminant_analysis = Later("sklearn.discriminant_analysis")
-stats = Later("scipy.stats")
 
 
 def gaussians(n: int, means, seed: int = 0, mix=None):
@@ -192,6 +191,7 @@ def test_each_judge_judges_once_and_never_its_own_group():
 
 def test_auroc_of_a_known_separation():
     """Two normals two deviations apart: Phi(2 / sqrt 2); ties count half."""
+    stats = Later("scipy.stats")
     rng = np.random.default_rng(0)
     have = embedding.auroc(rng.standard_normal(20000), 2 + rng.standard_normal(20000))
     assert abs(have - stats.norm.cdf(2 / np.sqrt(2))) < 0.003

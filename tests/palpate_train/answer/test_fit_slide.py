@@ -18,19 +18,19 @@ from palpate_train.data.sets import Dataset
 from tests.factories import toy_bundle
 
 
-def swept(speeds: list[float]) -> Dataset:
-    """One simulated sweep at each multiple of 30 mm/s."""
-    windows = []
-    for i, speed in enumerate(speeds):
-        rng, world = np.random.default_rng(i), replace(skin.WORLD, speed=speed)
-        windows.append(skin.window("plastic rough", skin.Placement(), rng, world))
-    labels = np.zeros(len(windows), np.int64)
-    groups = {"recording": np.arange(len(windows))}
-    return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")
-
-
 def test_the_range_covers_nearly_all_sweeps_or_has_a_reason():
     """Two wrong of a hundred do not widen it; without pitch, sweeps or slides none."""
+
+    def swept(speeds: list[float]) -> Dataset:
+        """One simulated sweep at each multiple of 30 mm/s."""
+        windows = []
+        for i, speed in enumerate(speeds):
+            rng, world = np.random.default_rng(i), replace(skin.WORLD, speed=speed)
+            windows.append(skin.window("plastic rough", skin.Placement(), rng, world))
+        labels = np.zeros(len(windows), np.int64)
+        groups = {"recording": np.arange(len(windows))}
+        return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")
+
     found, why = trained_speeds(swept([1.0, 2.0] * 4 + [1.5]), skin.PITCH_MM)
     assert found
     assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 60.0), rel=0.03)

@@ -96,30 +96,29 @@ def test_a_bundle_that_needs_no_single_taxel_tolerates_a_quarter(tmp_path: Path)
     bundle.Manifest.parse(replace(loaded.manifest, bridging=rule).json())
 
 
-def pressed(n: int = 40) -> Dataset:
-    """Two materials that differ in the load of row 1, whose taxels are pressed four times as hard
-    as their neighbours and together, by different forces."""
-    rng = np.random.default_rng(0)
-    labels, force = np.arange(n) % 2, rng.uniform(0.8, 1.2, n)
-    hard = np.array([4.0, 1.0, 1.0, 1.0])[:, None] * np.array([1.0, 1.2, 0.8, 1.1])
-    level = force[:, None, None] * (60 * hard + 60 * labels[:, None, None] * (hard > 2))
-    level = np.repeat(level[:, None], 100, axis=1)
-    samples = np.rint(level + rng.standard_normal(level.shape)).astype(np.int16)
-    return Dataset(samples, labels, ("a", "b"), 100.0, {}, "pressed")
-
-
-class Weighed:
-    """A box that names a material by the load of taxel 1.1."""
-
-    def __init__(self, told: bundle.Bundle, *rest: Any, **more: Any) -> None:
-        self.bundle, self.model_runner = told, None
-
-
 @pytest.mark.slow
 def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     """The loads tell a broken taxel there; where neighbours do as well, these stay."""
+
+    class Weighed:
+        """A box that names a material by the load of taxel 1.1."""
+
+        def __init__(self, told: bundle.Bundle, *rest: Any, **more: Any) -> None:
+            self.bundle, self.model_runner = told, None
+
+    def pressed(n: int = 40) -> Dataset:
+        """Two materials that differ in the load of row 1, whose taxels are pressed together, four
+        times as hard as their neighbours, by different forces."""
+        rng = np.random.default_rng(0)
+        labels, force = np.arange(n) % 2, rng.uniform(0.8, 1.2, n)
+        hard = np.array([4.0, 1.0, 1.0, 1.0])[:, None] * np.array([1.0, 1.2, 0.8, 1.1])
+        level = force[:, None, None] * (60 * hard + 60 * labels[:, None, None] * (hard > 2))
+        level = np.repeat(level[:, None], 100, axis=1)
+        samples = np.rint(level + rng.standard_normal(level.shape)).astype(np.int16)
+        return Dataset(samples, labels, ("a", "b"), 100.0, {}, "pressed")
+
     sweeps = pressed()
 
     def counts(self: Any, given: Dataset) -> list[Any]:

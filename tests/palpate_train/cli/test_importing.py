@@ -16,24 +16,14 @@ from palpate_train.data import sets
 from tests.factories.lab_files import csv_folder, write
 from tests.factories.paths import ROOT
 
-PAGE = (ROOT / "docs" / "how-to" / "import.md").read_text()
-
-
-def five() -> list[list[str]]:
-    """The commands of the page, split as a shell splits them."""
-    (block,) = re.findall(r"<!-- five -->\n(.*?)<!-- /five -->", PAGE, re.S)
-    return [shlex.split(line) for line in block.splitlines()]
-
-
-EVIL = "\x1b[2J\n\x9b1mtaken: 9 files\u202e"
-
 
 def test_names_of_files_forge_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Escape sequences and line breaks are shown as one printable line."""
+    evil = "\x1b[2J\n\x9b1mtaken: 9 files\u202e"
     folder, report = tmp_path / "recordings", tmp_path / "report.txt"
     folder.mkdir()
-    for name in ("wood_1", f"wool_{EVIL}", f"broken_{EVIL}", EVIL):
-        rows = "1,2,3,4\n" * 40 if "broken" not in name else f"{EVIL}\n1,2\n"
+    for name in ("wood_1", f"wool_{evil}", f"broken_{evil}", evil):
+        rows = "1,2,3,4\n" * 40 if "broken" not in name else f"{evil}\n1,2\n"
         (folder / f"{name}.csv").write_text(rows)
     out = str(tmp_path / "set.npz")
     words = ["--pattern", "{material}_{trial}.csv", "--grid", "2x2", "--rate", "20"]
@@ -55,9 +45,16 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     caplog: pytest.LogCaptureFixture,
 ):
     """Sweeps come back, most labels are right."""
+    page = (ROOT / "docs" / "how-to" / "import.md").read_text()
+
+    def five() -> list[list[str]]:
+        """The commands of the page, split as a shell splits them."""
+        (block,) = re.findall(r"<!-- five -->\n(.*?)<!-- /five -->", page, re.S)
+        return [shlex.split(line) for line in block.splitlines()]
+
     monkeypatch.chdir(tmp_path)
     folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
-    assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
+    assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in page
     commands = five()
     assert len(commands) == 5
     for program, *args in commands:
@@ -259,18 +256,14 @@ def test_a_terminal_without_unicode_shows_replaced_characters(tmp_path: Path):
     assert b"left out: k?per_?.txt: its name does not match the pattern" in done.stdout
 
 
-TABLE = (
-    "file;material;force\na/1.csv;felt;5N\n2.csv;cork;2.5N\n3.csv;felt;5N\nmissing.csv;cork;5N\n"
-)
-
-
 def test_labels_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """By path or name; files without a label are left out, a missing file is a fault."""
+    table = "file;material;force\na/1.csv;felt;5N\n2.csv;cork;2.5N\n3.csv;felt;5N\nno.csv;cork;5N\n"
     for name in ("a/1", "b/2", "b/3", "b/4"):
         counts = np.random.default_rng(int(name[-1])).integers(0, 99, (30, 4))
         (tmp_path / name).parent.mkdir(exist_ok=True)
         np.savetxt(tmp_path / f"{name}.csv", counts, "%d", ",")
-    (tmp_path / "labels.csv").write_text(TABLE)
+    (tmp_path / "labels.csv").write_text(table)
     out = tmp_path.parent / "made.npz"
     given = ("--rate", "100", "--grid", "2x2", "--window", "10", "--out", str(out))
     labels = ("--labels", str(tmp_path / "labels.csv"), "--pattern", "{session}/{}.csv")
@@ -280,7 +273,7 @@ def test_labels_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture
     assert made.groups["force"].tolist() == [5, 2.5, 5]
     assert made.groups["session"].tolist() == ["a", "b", "b"]
     said = capsys.readouterr().out
-    for name in ("b/4.csv", "labels.csv", "missing.csv"):
+    for name in ("b/4.csv", "labels.csv", "no.csv"):
         assert f"left out: {name}" in said
 
 

@@ -4,6 +4,7 @@ import os
 import pty
 import subprocess
 import sys
+from textwrap import dedent
 
 import pytest
 
@@ -12,45 +13,44 @@ from palpate_train.data.progress import ProgressLine, StageLine
 from tests.factories import terminals
 from tests.factories.paths import ROOT
 
-SCRIPT = """
-import sys, time
-from palpate_train.arguments.options import Log
-from palpate_train.data.progress import Progress
-log = Log()
-progress = Progress(4, log)
-progress("the first [bold]fold[/bold]")
-time.sleep(0.3)
-log.keep("a line that stays")
-print("a result", flush=True)
-log("not counted {what}")
-time.sleep(0.3)
-sys.exit(3)
-"""
-
-
-def on_a_terminal(out_too: bool) -> tuple[str, str]:
-    """The script's text on a terminal of 100 columns, and its output elsewhere."""
-    far, near = pty.openpty()
-    done = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT],
-        cwd=ROOT,
-        stdin=near,
-        stderr=near,
-        stdout=near if out_too else subprocess.PIPE,
-        env=os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
-    )
-    os.close(near)
-    shown = terminals.read(far, done)
-    os.close(far)
-    printed = done.stdout.read().decode() if done.stdout else ""
-    assert terminals.ended(done, shown) == 3
-    return shown.decode(), printed
-
 
 @pytest.mark.slow
 @pytest.mark.thorough  # trains on a terminal
 def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
     """The bar shows the share and the line, output stands above, the cursor comes back."""
+    script = dedent("""
+    import sys, time
+    from palpate_train.arguments.options import Log
+    from palpate_train.data.progress import Progress
+    log = Log()
+    progress = Progress(4, log)
+    progress("the first [bold]fold[/bold]")
+    time.sleep(0.3)
+    log.keep("a line that stays")
+    print("a result", flush=True)
+    log("not counted {what}")
+    time.sleep(0.3)
+    sys.exit(3)
+    """)
+
+    def on_a_terminal(out_too: bool) -> tuple[str, str]:
+        """The script's text on a terminal of 100 columns, and its output elsewhere."""
+        far, near = pty.openpty()
+        done = subprocess.Popen(
+            [sys.executable, "-c", script],
+            cwd=ROOT,
+            stdin=near,
+            stderr=near,
+            stdout=near if out_too else subprocess.PIPE,
+            env=os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
+        )
+        os.close(near)
+        shown = terminals.read(far, done)
+        os.close(far)
+        printed = done.stdout.read().decode() if done.stdout else ""
+        assert terminals.ended(done, shown) == 3
+        return shown.decode(), printed
+
     shown, printed = on_a_terminal(out_too=False)
     for text in (
         "━",

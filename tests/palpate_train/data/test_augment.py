@@ -10,8 +10,6 @@ import pytest
 from palpate_train.data.augment import SLOW, Augmentation, augment, default_augmentation
 from tests.factories.later import Later
 
-stats = Later("scipy.stats")
-
 OFF = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
 NAMES = tuple(f.name for f in fields(Augmentation) if f.name not in ("shift", "displaced"))
 
@@ -25,12 +23,6 @@ def sweeps(n: int = 16, taxels: int = 16, frames: int = 300, seed: int = 1) -> n
 def varied(x: np.ndarray, rows: int = 4, seed: int = 2, **settings: float) -> np.ndarray:
     """`x` with these settings and no others."""
     return augment(x, rows, replace(OFF, **settings), np.random.default_rng(seed))
-
-
-def band(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Mean power [B] between two shares of half the sampling rate."""
-    power = (np.abs(np.fft.rfft(x)) ** 2).mean(axis=1)
-    return power[:, int(low * power.shape[1]) : int(high * power.shape[1])].mean(axis=1)
 
 
 def test_nothing_varies_at_zero_and_little_without_vibrations():
@@ -122,6 +114,12 @@ def test_a_share_of_the_taxels_is_silent_or_noisy():
 @pytest.mark.slow
 def test_damping_takes_high_rates_and_colour_any():
     """Damping lowers the highest rates, never the lowest; colour raises some bands."""
+
+    def band(x: np.ndarray, low: float, high: float) -> np.ndarray:
+        """Mean power [B] between two shares of half the sampling rate."""
+        power = (np.abs(np.fft.rfft(x)) ** 2).mean(axis=1)
+        return power[:, int(low * power.shape[1]) : int(high * power.shape[1])].mean(axis=1)
+
     x = sweeps(200, frames=512)
     damped = varied(x, damped=0.5)
     high, low = (band(damped, *edges) / band(x, *edges) for edges in ((0.8, 1), (0.002, 0.008)))
@@ -140,6 +138,7 @@ def test_damping_takes_high_rates_and_colour_any():
 
 def test_noise_is_white_and_of_another_level_in_every_sweep():
     """Its level, equal for all taxels, lies between almost nothing and the maximum."""
+    stats = Later("scipy.stats")
     added = varied(np.zeros((100, 16, 2000), np.float32), noise=0.5)
     level = added.std(axis=2)
     assert level.max() < 0.53

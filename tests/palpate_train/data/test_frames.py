@@ -33,24 +33,6 @@ def cube(rows: int, columns: int, count: int, axes: int = 0) -> np.ndarray:
     return np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
 
 
-def stored(path: Path, values: np.ndarray, how: str) -> Table:
-    """A table read from a file of `values`, as each program stores them."""
-    if how == "npy":
-        np.save(path.with_suffix(".npy"), values)
-        return raw_files.read(path.with_suffix(".npy"))
-    if how == "mat":
-        scipy_io.savemat(path.with_suffix(".mat"), {"skin": values})
-        return raw_files.read(path.with_suffix(".mat"))
-    suffix = ".mat" if how == "v7.3" else ".h5"
-    with h5py.File(path.with_suffix(suffix), "w") as file:
-        if how == "h5":
-            file["skin"] = values
-        else:
-            file["skin"] = values.T
-            file["skin"].attrs["MATLAB_class"] = np.bytes_("int32")
-    return raw_files.read(path.with_suffix(suffix))
-
-
 @pytest.mark.parametrize("how", ["npy", "mat", "v7.3", "h5", "h5 of MATLAB"])
 @pytest.mark.parametrize(
     ("rows", "columns", "axes"), [(4, 4, 0), (2, 5, 0), (4, 4, 3), (16, 16, 0)]
@@ -60,6 +42,24 @@ def test_the_last_axis_is_the_time_if_only_it_fits(
     tmp_path: Path, how: str, rows: int, columns: int, axes: int, grid: bool
 ):
     """(row, column, frame) and (frame, row, column) give the same frames; the first is said."""
+
+    def stored(path: Path, values: np.ndarray, how: str) -> Table:
+        """A table read from a file of `values`, as each program stores them."""
+        if how == "npy":
+            np.save(path.with_suffix(".npy"), values)
+            return raw_files.read(path.with_suffix(".npy"))
+        if how == "mat":
+            scipy_io.savemat(path.with_suffix(".mat"), {"skin": values})
+            return raw_files.read(path.with_suffix(".mat"))
+        suffix = ".mat" if how == "v7.3" else ".h5"
+        with h5py.File(path.with_suffix(suffix), "w") as file:
+            if how == "h5":
+                file["skin"] = values
+            else:
+                file["skin"] = values.T
+                file["skin"].attrs["MATLAB_class"] = np.bytes_("int32")
+        return raw_files.read(path.with_suffix(suffix))
+
     x = cube(rows, columns, 60, axes)
     last = np.moveaxis(x, 0, -1)
     name = f"{rows}x{columns}x{axes}" if axes else f"{rows}x{columns}"

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -121,24 +122,6 @@ def test_an_episode_that_lacks_a_frame_is_refused(
     assert "episode 1 lacks" in capsys.readouterr().err
 
 
-BY_LEROBOT = """
-import json, sys
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-first, second = 0, 1 / 750
-whole = LeRobotDataset("own/set", root=sys.argv[1])
-part = LeRobotDataset("own/set", root=sys.argv[1], episodes=[5],
-                      delta_timestamps={"observation.tactile": [first, second]})
-print(json.dumps({
-    "size": [whole.num_episodes, len(whole), whole.fps],
-    "tasks": [part[0]["task"], whole[0]["task"]],
-    "two frames": part[0]["observation.tactile"].tolist(),
-    "position": int(part[0]["position"]),
-    "mean": whole.meta.stats["observation.tactile"]["mean"].tolist(),
-    "normal": whole.meta.stats["observation.tactile"]["std"].shape,
-}))
-"""
-
-
 def written(folder: Path) -> sets.Dataset:
     """A simulated set of three materials that is written as the data set `folder`."""
     whole = sets.load("sim:T-REAL:1:1").select(["material=foam,metal,wood", "position<=1"])
@@ -167,10 +150,26 @@ def test_a_set_is_written_and_read_back(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.slow
 def test_lerobot_itself_reads_a_written_set(tmp_path: Path):
     """Frames at neighbouring times, tasks, groups and statistics."""
+    by_lerobot = dedent("""
+    import json, sys
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    first, second = 0, 1 / 750
+    whole = LeRobotDataset("own/set", root=sys.argv[1])
+    part = LeRobotDataset("own/set", root=sys.argv[1], episodes=[5],
+                          delta_timestamps={"observation.tactile": [first, second]})
+    print(json.dumps({
+        "size": [whole.num_episodes, len(whole), whole.fps],
+        "tasks": [part[0]["task"], whole[0]["task"]],
+        "two frames": part[0]["observation.tactile"].tolist(),
+        "position": int(part[0]["position"]),
+        "mean": whole.meta.stats["observation.tactile"]["mean"].tolist(),
+        "normal": whole.meta.stats["observation.tactile"]["std"].shape,
+    }))
+    """)
     environment.required()
     pytest.importorskip("pyarrow")
     whole = written(tmp_path / "set")
-    found = environment.run(BY_LEROBOT, tmp_path / "set")
+    found = environment.run(by_lerobot, tmp_path / "set")
     assert found["size"] == [6, 9000, 750]
     assert found["tasks"] == [whole.materials[whole.labels[k]] for k in (5, 0)]
     assert found["two frames"] == whole.samples[5, :2].tolist()

@@ -412,9 +412,9 @@ def test_ssh_is_asked_without_questions(ground: Ground):
     assert "ConnectTimeout=10" in asked
 
 
-@pytest.fixture
-def sshd(tmp_path: Path) -> list[str]:
-    """A real sshd on loopback with its own key; the options that reach it."""
+@pytest.mark.slow
+def test_through_a_real_sshd(tmp_path: Path):
+    """Keys, a login shell, the real tools: all is fetched; a wrong key connects not."""
     if not SSHD.exists():
         pytest.skip("no sshd: apt-get install openssh-server")
     if os.getuid() == 0:
@@ -433,15 +433,10 @@ def sshd(tmp_path: Path) -> list[str]:
     proxy = f"ProxyCommand={SSHD} -i -f {tmp_path}/config"
     options = [proxy, f"IdentityFile={tmp_path}/mine", f"UserKnownHostsFile={tmp_path}/known"]
     options += ["StrictHostKeyChecking=accept-new", "IdentityAgent=none"]
-    return ["-F", "none", *(part for option in options for part in ("-o", option))]
-
-
-@pytest.mark.slow
-def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
-    """Keys, a login shell, the real tools: all is fetched; a wrong key connects not."""
+    reach = ["-F", "none", *(part for option in options for part in ("-o", option))]
     for i in range(3):
         record(tmp_path / "box" / "a session" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
-    box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)
+    box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), reach)
     tally = PullReport()
     pull.pull(box, tmp_path / "here", tally, lambda line: None)
     pull.pull(box, tmp_path / "here", tally, lambda line: None)

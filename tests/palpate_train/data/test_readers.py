@@ -57,18 +57,18 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
     assert sets.digest(b) == sets.digest(a)
 
 
-class FullDisk(io.BytesIO):
-    """A file that takes 2 kB."""
-
-    def write(self, data) -> int:
-        """As on a full disk."""
-        if self.tell() + len(data) > 2048:
-            raise OSError(28, "No space left on device")
-        return super().write(data)
-
-
 def test_a_full_disk_does_not_end_the_program():
     """h5py dies if its file raises an error while it closes; the error comes after that."""
+
+    class FullDisk(io.BytesIO):
+        """A file that takes 2 kB."""
+
+        def write(self, data) -> int:
+            """As on a full disk."""
+            if self.tell() + len(data) > 2048:
+                raise OSError(28, "No space left on device")
+            return super().write(data)
+
     noise = np.random.default_rng(5).integers(0, 255, (6, 100, 4, 4))
     with pytest.raises(OSError, match="No space left"):
         readers.write_hdf5(FullDisk(), {"samples": noise, "materials": ["wood"]})

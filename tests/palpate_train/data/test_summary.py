@@ -16,12 +16,6 @@ from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy, write
 
 
-def command(*words: str) -> None:
-    """The command `sets`."""
-    args = PROGRAM.parser("sets").parse_args(["sets", *words])
-    args.run(args)
-
-
 def told(sweeps: sets.Dataset) -> dict[str, list[str]]:
     """The lines of a description that name a property, as its name and the parts of its text."""
     lines = [line[2:] for line in summary.description(sweeps)[1:] if line[2] != " "]
@@ -158,6 +152,12 @@ def test_what_is_known_can_be_loaded():
 @pytest.mark.slow
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """`sets` lists, `describe` describes several, `view` writes a picture."""
+
+    def command(*words: str) -> None:
+        """The command `sets`."""
+        args = PROGRAM.parser("sets").parse_args(["sets", *words])
+        args.run(args)
+
     command()
     assert capsys.readouterr().out == summary.known() + "\n"
     one = write(tmp_path / "a.npz")

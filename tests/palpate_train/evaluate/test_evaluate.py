@@ -20,18 +20,6 @@ from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from tests.factories.sweep_sets import tones
 
-KEYS = {
-    "method",
-    "protocol",
-    "means_removed",
-    "seed",
-    "window",
-    "recording",
-    "interval",
-    "fit_s",
-    "ms_p50",
-}
-
 
 def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.Result]:
     given = {"protocols": ("leave:session",), **plan}
@@ -218,6 +206,17 @@ def test_the_command_writes_what_scripts_rely_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """The documented keys, one result for each method and seed, in order."""
+    keys = {
+        "method",
+        "protocol",
+        "means_removed",
+        "seed",
+        "window",
+        "recording",
+        "interval",
+        "fit_s",
+        "ms_p50",
+    }
     tones(offset=9.0).save(tmp_path / "tones.npz")
     words = f"--set {tmp_path / 'tones.npz'} --protocol leave:session --method H-knn,L-gauss"
     words += " --seeds 2 --remove-means --only material=a,c session<=2"
@@ -225,7 +224,7 @@ def test_the_command_writes_what_scripts_rely_on(
     made = [(r["method"], r["seed"]) for r in results]
     assert made == [("H-knn", 1), ("H-knn", 2), ("L-gauss", 1), ("L-gauss", 2)]
     for result in results:
-        assert set(result) >= KEYS
+        assert set(result) >= keys
         assert result["protocol"] == "leave:session"
         assert result["means_removed"] is True
         assert result["materials"] == ["a", "c"]
@@ -275,6 +274,24 @@ def test_a_method_refused_in_one_fold_loses_no_other_result(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ):
     """A refusal is named once for a protocol and seed; the others are complete."""
+
+    @dataclass(frozen=True)
+    class Spoilt:
+        """A model that fails after training, or gives logits that are not numbers."""
+
+        model: methods.Model
+        how: str
+
+        def logits(self, inputs: np.ndarray) -> np.ndarray:
+            """Fail, or give logits that cannot be used."""
+            if self.how == "logits":
+                raise FormatError("too few of something")
+            return self.model.logits(inputs) * np.nan
+
+        def graph(self) -> onnx.ModelProto:
+            """The graph of the sound model."""
+            return self.model.graph()
+
     calls: list[int] = []
     (sound,) = methods.find(["L-gauss"])
 
@@ -302,24 +319,6 @@ def test_a_method_refused_in_one_fold_loses_no_other_result(
     why = "gave a logit that is not finite" if broken == "not finite" else "too few of something"
     assert why in results[0].refused
     assert results[2].json()["window"]["total"] == 36
-
-
-@dataclass(frozen=True)
-class Spoilt:
-    """A model that fails after training, or gives logits that are not numbers."""
-
-    model: methods.Model
-    how: str
-
-    def logits(self, inputs: np.ndarray) -> np.ndarray:
-        """Fail, or give logits that cannot be used."""
-        if self.how == "logits":
-            raise FormatError("too few of something")
-        return self.model.logits(inputs) * np.nan
-
-    def graph(self) -> onnx.ModelProto:
-        """The graph of the sound model."""
-        return self.model.graph()
 
 
 def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):

@@ -36,13 +36,13 @@ def add(task: int, data: np.ndarray) -> float:
     return float(data[task] + data.sum())
 
 
-def threads(task: int) -> int:
-    """The number of threads that a linear algebra library may use."""
-    return max(entry["num_threads"] for entry in threadpoolctl.threadpool_info())
-
-
 def test_every_task_is_done_once_in_one_thread():
     """Each result comes with its task, and an error is raised here."""
+
+    def threads(task: int) -> int:
+        """The number of threads that a linear algebra library may use."""
+        return max(entry["num_threads"] for entry in threadpoolctl.threadpool_info())
+
     data = np.arange(50.0)
     done = dict(parallel.results(add, range(20), [data], jobs=2))
     assert done == {task: task + 1225.0 for task in range(20)}
@@ -120,20 +120,20 @@ def test_a_cluster_gives_the_same_bits(cluster):
         assert there[name].json()["window"] == here[name].json()["window"]
 
 
-def noted(task: int, folder: str, data: np.ndarray) -> float:
-    """A task that leaves a note for each run. The first run of task 7 kills its worker."""
-    if task == 7:
-        with contextlib.suppress(FileExistsError):
-            Path(folder, "killed").touch(exist_ok=False)
-            os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.25)
-    Path(folder, f"{task}-{os.getpid()}").touch()
-    return float(data[task])
-
-
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
     """One of two is killed during twenty tasks: only its task runs twice."""
+
+    def noted(task: int, folder: str, data: np.ndarray) -> float:
+        """A task that leaves a note for each run. The first run of task 7 kills its worker."""
+        if task == 7:
+            with contextlib.suppress(FileExistsError):
+                Path(folder, "killed").touch(exist_ok=False)
+                os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.25)
+        Path(folder, f"{task}-{os.getpid()}").touch()
+        return float(data[task])
+
     address, workers = cluster
     data = np.arange(20.0)
     done = dict(parallel.results(noted, range(20), [str(tmp_path), data], scheduler=address))
@@ -166,16 +166,16 @@ def test_a_cluster_without_the_project_is_named(
         )
 
 
-def always_dies(task: int) -> None:
-    """A task that kills its worker."""
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_task_that_kills_every_worker_ends_with_a_reason(
     cluster, monkeypatch: pytest.MonkeyPatch
 ):
     """The call ends if no worker is left."""
+
+    def always_dies(task: int) -> None:
+        """A task that kills its worker."""
+        os.kill(os.getpid(), signal.SIGKILL)
+
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match=r"often|worker"):
         list(parallel.results(always_dies, [1], [], scheduler=cluster[0]))

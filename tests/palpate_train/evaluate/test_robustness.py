@@ -26,23 +26,23 @@ def test_the_fall_is_between_two_severities(accuracy: tuple[float, ...], fall: f
     assert found == (None if fall is None else pytest.approx(fall))
 
 
-def task(method: str, seed: int, right: list[int]) -> dict:
-    """A task written by hand: 20 sweeps under one corruption."""
-    curve = {
-        "title": "dead taxels",
-        "unit": "taxels",
-        "about": "",
-        "severities": [0.0, 1.0, 2.0],
-        "right": right,
-        "low": [n / 20 - 0.1 for n in right],
-        "high": [n / 20 + 0.05 for n in right],
-    }
-    about = {"method": method, "seed": seed, "set": "x", "refused": "", "total": 20}
-    return about | {"curves": {"dead": curve}, "pairs": {}}
-
-
 def test_merged_by_hand():
     """Sums, band, fall and loss of two seeds, in any order of completion; a refusal stays."""
+
+    def task(method: str, seed: int, right: list[int]) -> dict:
+        """A task written by hand: 20 sweeps under one corruption."""
+        curve = {
+            "title": "dead taxels",
+            "unit": "taxels",
+            "about": "",
+            "severities": [0.0, 1.0, 2.0],
+            "right": right,
+            "low": [n / 20 - 0.1 for n in right],
+            "high": [n / 20 + 0.05 for n in right],
+        }
+        about = {"method": method, "seed": seed, "set": "x", "refused": "", "total": 20}
+        return about | {"curves": {"dead": curve}, "pairs": {}}
+
     no = {"method": "c", "seed": 0, "set": "x", "refused": "too short"}
     tasks = [task("a", 0, [18, 16, 10]), task("a", 1, [20, 18, 2]), task("b", 0, [10] * 3), no]
     result = robustness.merge(tasks)

@@ -14,13 +14,13 @@ from palpate_train.evaluate import set_warnings, trivial
 from tests.factories.sweep_sets import easy, tones
 
 
-def of_protocol(sweeps: Dataset, text: str) -> list[str]:
-    """The warnings about a protocol."""
-    return list(set_warnings.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
-
-
 def test_what_no_fold_can_judge_is_counted():
     """Materials of one session where these are left out; frames shared by windows."""
+
+    def of_protocol(sweeps: Dataset, text: str) -> list[str]:
+        """The warnings about a protocol."""
+        return list(set_warnings.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
+
     sweeps = easy(8)
     sweeps.groups["session"] = sweeps.labels * 2 + np.arange(24) % 2
     half = replace(sweeps, groups=sweeps.groups | {"session": sweeps.labels})

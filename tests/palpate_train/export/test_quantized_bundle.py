@@ -53,7 +53,6 @@ from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import with_stages
 
 torch = Later("torch")
-paper_cnn = Later("palpate_studies.peers.paper_cnn")
 stages = Later("palpate_train.models.recipe.stages")
 
 pytestmark = pytest.mark.slow
@@ -107,15 +106,6 @@ def box(folder: Path) -> Classifier:
     return Classifier(bundle.load(folder), SystemClock())
 
 
-def shapes(model: onnx.ModelProto) -> list[list[int]]:
-    """Every inferred shape of the graph."""
-    graph = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
-    return [
-        [d.dim_value for d in v.type.tensor_type.shape.dim]
-        for v in (*graph.input, *graph.value_info, *graph.output)
-    ]
-
-
 def operators(folder: Path) -> set[str]:
     """The operators of a bundle's graph."""
     return {n.op_type for n in onnx.load(folder / bundle.MODEL).graph.node}
@@ -129,6 +119,15 @@ def negated(fitted: Fit) -> Fit:
 @pytest.mark.parametrize("dtype", graph_builder.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
     """For each type PyTorch's logits, fixed shapes, and the sensor's counts as input."""
+
+    def shapes(model: onnx.ModelProto) -> list[list[int]]:
+        """Every inferred shape of the graph."""
+        graph = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
+        return [
+            [d.dim_value for d in v.type.tensor_type.shape.dim]
+            for v in (*graph.input, *graph.value_info, *graph.output)
+        ]
+
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = stages.StagesNetwork(form, 3, 0.1, norm=False).eval()
@@ -348,14 +347,6 @@ def test_a_saturated_layer_and_an_old_head_are_refused(tight: Fit):
         judged(replace(refitted, weights=refitted.weights | stale))
 
 
-def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
-    """`n` sweeps with some lost and some won by int8; the rest is perfect."""
-    right = np.arange(n) >= won, np.arange(n) < n - lost
-    usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
-    difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
-    return parity.Parity(difference, parity.loss(*right))
-
-
 @pytest.mark.parametrize(
     ("good", "bad", "message"),
     [
@@ -377,6 +368,19 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
 )
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     """Beyond a limit the message names number, limit and remedy."""
+
+    def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
+        """`n` sweeps with some lost and some won by int8; the rest is perfect."""
+        right = np.arange(n) >= won, np.arange(n) < n - lost
+        usual = {
+            "agreement": 1,
+            "expected_loss": 0,
+            "probability_difference": 0,
+            "probability_mean": 0,
+        }
+        difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
+        return parity.Parity(difference, parity.loss(*right))
+
     quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
         quantized_bundle.check(found(**bad))
@@ -463,6 +467,7 @@ def test_the_default_bundle_is_what_the_box_needs():
 @pytest.mark.filterwarnings("error")
 def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """The paper's number of parameters, six logits, no log."""
+    paper_cnn = Later("palpate_studies.peers.paper_cnn")
     whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
     assert cost.weights(whole) == 15_891_910
     references.write(tmp_path / "new")

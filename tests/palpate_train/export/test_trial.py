@@ -43,16 +43,6 @@ def test_a_bundle_answers_without_any_rule(name: str):
         rules.without(less, [name])
 
 
-def counts(needed: set[str], junk_needs: set[str]):
-    """Answers of a box that needs some rules for copies, and others for junk."""
-
-    def counted(of: Bundle, given: list[trial.Given]) -> Counts:
-        there = set(rules.present(of))
-        return Counts(300 - 2 * len(needed - there), 9 + len(junk_needs - there))
-
-    return counted
-
-
 @pytest.mark.parametrize(
     ("needed", "junk_needs", "asked", "out"),
     [
@@ -71,6 +61,16 @@ def test_a_rule_is_dropped_kept_or_forced(
     monkeypatch: pytest.MonkeyPatch,
 ):
     """Half a point of copies, any junk, or a wish keeps it."""
+
+    def counts(needed: set[str], junk_needs: set[str]):
+        """Answers of a box that needs some rules for copies, and others for junk."""
+
+        def counted(of: Bundle, given: list[trial.Given]) -> Counts:
+            there = set(rules.present(of))
+            return Counts(300 - 2 * len(needed - there), 9 + len(junk_needs - there))
+
+        return counted
+
     monkeypatch.setattr(trial, "EACH", 6)
     monkeypatch.setattr(trial, "_counted", counts(needed, junk_needs))
     monkeypatch.setattr(tolerances, "LOST", 1 / 300)

@@ -61,17 +61,6 @@ def folder(rigged: Callable[..., Rigged], tmp_path: Path) -> Path:
     return whole
 
 
-def exported(source: Path, out: Path) -> bundle.Bundle:
-    """The bundle of a set, by command."""
-    fit = str(out.with_suffix(".npz"))
-    assert main(["fit", "--set", str(source), "--seed", "1", "--out", fit]) == 0
-    assert (
-        main(["export", fit, "--out", str(out), "--name", "x", "--version", "1", "--pitch-mm", "4"])
-        == 0
-    )
-    return bundle.load(out)
-
-
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole way to a bundle
 def test_the_whole_way(
@@ -80,6 +69,30 @@ def test_the_whole_way(
     """record, fit, export, box: an untouched window is `no-contact`, a touched one has its label
     and is in place. A skin with another rest works after TARE. Without an unloaded skin in the
     recordings, export says that `no-contact` cannot be recognised, and the box never answers it."""
+
+    def exported(source: Path, out: Path) -> bundle.Bundle:
+        """The bundle of a set, by command."""
+        fit = str(out.with_suffix(".npz"))
+        assert main(["fit", "--set", str(source), "--seed", "1", "--out", fit]) == 0
+        assert (
+            main(
+                [
+                    "export",
+                    fit,
+                    "--out",
+                    str(out),
+                    "--name",
+                    "x",
+                    "--version",
+                    "1",
+                    "--pitch-mm",
+                    "4",
+                ]
+            )
+            == 0
+        )
+        return bundle.load(out)
+
     model = exported(folder, tmp_path / "known")
     assert "no-contact cannot" not in capsys.readouterr().out
     m = model.manifest

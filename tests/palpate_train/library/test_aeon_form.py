@@ -11,7 +11,6 @@ RNG = np.random.default_rng(5)
 LABELS = np.array(["felt", "wood"])[np.arange(32) % 2]
 SWEEPS = RNG.normal(0, 8, (32, 4, 100)) + 100
 SWEEPS[LABELS == "wood"] += 20 * np.sin(np.arange(100) * 0.9)
-small = partial(dict, steps=0, size="bands", grid=(2, 2))
 
 
 @pytest.fixture
@@ -25,6 +24,7 @@ def form() -> Any:
 
 def test_it_answers_as_the_classifier_does(form: Any):
     """Fit, labels and probabilities; it can stand at the end of a pipeline of aeon."""
+    small = partial(dict, steps=0, size="bands", grid=(2, 2))
     from aeon.classification.compose import ClassifierPipeline
     from aeon.transformations.collection import Normalizer
 

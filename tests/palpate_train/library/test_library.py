@@ -17,11 +17,7 @@ from palpate.core.errors import FormatError
 from palpate.inference import session
 from tests.factories.later import Later
 
-base = Later("sklearn.base")
 exceptions = Later("sklearn.exceptions")
-linear_model = Later("sklearn.linear_model")
-model_selection = Later("sklearn.model_selection")
-pipeline = Later("sklearn.pipeline")
 estimator_checks = Later("sklearn.utils.estimator_checks")
 pandas = Later("pandas")
 library = Later("palpate_train.library")
@@ -93,6 +89,7 @@ def test_a_sweep_that_counts_nothing_changes_no_head(
 
 def test_parameters_without_a_fit(fitted: PalpateClassifier):
     """Clones have the parameters, and no fit."""
+    base = Later("sklearn.base")
     for check in (
         estimator_checks.check_no_attributes_set_in_init,
         estimator_checks.check_parameters_default_constructible,
@@ -107,6 +104,8 @@ def test_parameters_without_a_fit(fitted: PalpateClassifier):
 
 def test_answers_and_features_are_those_of_the_head(fitted: PalpateClassifier):
     """In the order of classes_, for both shapes; its own head gives its logits."""
+    pipeline = Later("sklearn.pipeline")
+    linear_model = Later("sklearn.linear_model")
     assert fitted.classes_.tolist() == ["felt", "wood"]
     assert fitted.score(SWEEPS[36:], LABELS[36:]) == 1
     found = fitted.predict_proba(SWEEPS[36:])
@@ -130,6 +129,7 @@ def test_answers_and_features_are_those_of_the_head(fitted: PalpateClassifier):
 @pytest.mark.thorough  # four fits
 def test_groups_are_left_out():
     """cross_val_score over whole groups."""
+    model_selection = Later("sklearn.model_selection")
     leave = model_selection.LeaveOneGroupOut()
     found = model_selection.cross_val_score(small(), SWEEPS, LABELS, groups=GROUPS, cv=leave)
     assert found.tolist() == [1, 1, 1, 1]
@@ -138,6 +138,8 @@ def test_groups_are_left_out():
 @pytest.mark.slow
 def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path: Path):
     """save_bundle, library.load_bundle, predict; the card names the origin of the bundle."""
+    # Words of the box's own refusals
+    also = "holds|inf|objects|grid|impossible"
     manifest = fitted.save_bundle(tmp_path / "b", licence="CC-BY-4.0", proven=False)
     assert manifest.labels == ("felt", "wood")
     head = yaml.safe_load((tmp_path / "b" / "card.md").read_text().split("---")[1])
@@ -163,7 +165,7 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
         np.testing.assert_array_equal(box.predict_proba(form(SWEEPS[36:].astype("i2"))), want)
     for x, why in REFUSED.values():
         if 0 not in getattr(x, "shape", ()):
-            with pytest.raises(ValueError, match=f"{why}|{ALSO}"):
+            with pytest.raises(ValueError, match=f"{why}|{also}"):
                 box.predict(x)
     with pytest.raises(FormatError, match="takes 2x2 uint8"):
         box.predict(SWEEPS[36:, :, :50])
@@ -247,8 +249,6 @@ def broken(value: float) -> np.ndarray:
     return x
 
 
-ALSO = "holds|inf|objects|grid|impossible"
-"""Words of the box's own refusals."""
 REFUSED: dict[str, tuple[Any, str]] = {
     "NaN": (broken(np.nan), "NaN"),
     "infinite": (broken(np.inf), "inf"),

@@ -6,15 +6,15 @@ import pytest
 from palpate_train.onnx_tools import parity
 
 
-def booleans(n: int, wrong: list[int]) -> np.ndarray:
-    """All right except those in `wrong`."""
-    right = np.ones(n, bool)
-    right[wrong] = False
-    return right
-
-
 def test_what_is_lost_is_counted_in_pairs_and_groups():
     """Three lost, one won; all losses in one of five recordings widen the interval."""
+
+    def booleans(n: int, wrong: list[int]) -> np.ndarray:
+        """All right except those in `wrong`."""
+        right = np.ones(n, bool)
+        right[wrong] = False
+        return right
+
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
     assert (lost.total, lost.float_right, lost.int8_right) == (50, 49, 47)
     assert lost.lost == pytest.approx(0.04)

@@ -23,15 +23,6 @@ def drawn(draw: Draw, plain: bool = False) -> str:
     return plot_style.to_svg(figure, "about", plain)
 
 
-def titles(svg: str) -> list[str | None]:
-    """The titles of the axes with numbers."""
-    return [
-        found
-        for node in ElementTree.fromstring(svg).iter()
-        if (found := node.get("data-axis")) is not None
-    ]
-
-
 @pytest.mark.parametrize(
     ("draw", "there"),
     [
@@ -62,6 +53,15 @@ def titles(svg: str) -> list[str | None]:
 )
 def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw, there: list[str]):
     """The title of an axis is an attribute; axes without numbers need none."""
+
+    def titles(svg: str) -> list[str | None]:
+        """The titles of the axes with numbers."""
+        return [
+            found
+            for node in ElementTree.fromstring(svg).iter()
+            if (found := node.get("data-axis")) is not None
+        ]
+
     assert titles(drawn(draw)) == there
 
 

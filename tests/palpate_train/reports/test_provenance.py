@@ -16,7 +16,6 @@ from tests.factories.page_reader import PageReader
 ABOUT = Provenance(
     ("abc", "def+"), ("12345678",), ("sim:T-REAL:1", "a & b <c>--d.npz"), (1, 2), "2026-11-22"
 )
-SVG = '<svg xmlns="http://www.w3.org/2000/svg"><title>a</title></svg>'
 
 
 def as_html(about: Provenance, home: str = html.HOME) -> str:
@@ -25,26 +24,27 @@ def as_html(about: Provenance, home: str = html.HOME) -> str:
     return html.render("base.html.j2", folder, header=about, home=home)
 
 
-def written(folder: Path, about: Provenance) -> list[Path]:
-    """One file of each kind with this header."""
-    texts = {
-        "a.html": as_html(about),
-        "a.svg": provenance.in_svg(SVG, about),
-        "a.md": provenance.in_markdown("# Title\n\nText.\n", about),
-    }
-    for name, text in texts.items():
-        (folder / name).write_text(text)
-    return [folder / name for name in texts]
-
-
 def test_each_kind_of_file_has_one_header(tmp_path: Path):
     """Names may hold tags and quotes; a second takes the place of the first."""
+    svg = '<svg xmlns="http://www.w3.org/2000/svg"><title>a</title></svg>'
+
+    def written(folder: Path, about: Provenance) -> list[Path]:
+        """One file of each kind with this header."""
+        texts = {
+            "a.html": as_html(about),
+            "a.svg": provenance.in_svg(svg, about),
+            "a.md": provenance.in_markdown("# Title\n\nText.\n", about),
+        }
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        return [folder / name for name in texts]
+
     for path in written(tmp_path, ABOUT):
         assert provenance.read(path) == ABOUT, path.name
     (tmp_path / "a.json").write_text(json.dumps({"commit": "abc", "bundle": "12345678", "seed": 3}))
     assert provenance.read(tmp_path / "a.json") == Provenance(("abc",), ("12345678",), (), (3,))
     other = replace(ABOUT, commit=("fff",), bundle=(score.shipped(),))
-    assert provenance.in_svg(provenance.in_svg(SVG, ABOUT), other) == provenance.in_svg(SVG, other)
+    assert provenance.in_svg(provenance.in_svg(svg, ABOUT), other) == provenance.in_svg(svg, other)
     page = "# Title\n\nText -- and <!-- a --> more.\n\n- line\n"
     again = provenance.in_markdown(provenance.in_markdown(page, ABOUT), other)
     assert again == provenance.in_markdown(page, other)

@@ -85,38 +85,36 @@ def chosen(**more: Any) -> Json:
     return judged | run | more
 
 
-def missed() -> Json:
-    """A single size that misses the target, with no groups that vary and no budget."""
-    return chosen(
-        **{"chosen": "bands", "best": "bands", "wanted": 0.99, "accuracy": _accuracy(0.51)},
-        rungs=[_model("bands", 0.08, 0.512, 0.0)],
-        **{"smaller": None, "larger": None, "less": [], "honest": None, "confused": []},
-        bundle={"content": "spectrum", "kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}},
-        budget={"slower": 1},
-        groups=["recording"],
-    )
-
-
-FACTS = (
-    "pairs with 0.5 s of each sweep is enough to distinguish 3 materials",
-    "a bundle of 12 kB, 0.118 ms a sweep",
-    "relations at 3 scales, spectrum <i>",
-    "tested on it (4 × pairs, 1 × 64).",
-    "Reached: 90 % is wanted; it is not certain",
-    "bands classifies 12.3 [10.3, 14.3] points fewer correctly",
-    "64 classifies 0.8 [−1.2, 2.8] points more correctly",
-    "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points.",
-    "1 % of 50 ms, 2 % of 500 kB",
-    "all sweeps are simulated.",
-)
-
-
 def test_page_and_terminal_say_the_same_and_a_poor_choice_first():
     """With reason, neighbours and budget; a poor choice has no neighbours or curve."""
+    facts = (
+        "pairs with 0.5 s of each sweep is enough to distinguish 3 materials",
+        "a bundle of 12 kB, 0.118 ms a sweep",
+        "relations at 3 scales, spectrum <i>",
+        "tested on it (4 × pairs, 1 × 64).",
+        "Reached: 90 % is wanted; it is not certain",
+        "bands classifies 12.3 [10.3, 14.3] points fewer correctly",
+        "64 classifies 0.8 [−1.2, 2.8] points more correctly",
+        "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points.",
+        "1 % of 50 ms, 2 % of 500 kB",
+        "all sweeps are simulated.",
+    )
+
+    def missed() -> Json:
+        """A single size that misses the target, with no groups that vary and no budget."""
+        return chosen(
+            **{"chosen": "bands", "best": "bands", "wanted": 0.99, "accuracy": _accuracy(0.51)},
+            rungs=[_model("bands", 0.08, 0.512, 0.0)],
+            **{"smaller": None, "larger": None, "less": [], "honest": None, "confused": []},
+            bundle={"content": "spectrum", "kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}},
+            budget={"slower": 1},
+            groups=["recording"],
+        )
+
     terminal = selection_report.text(chosen())
     page = PageReader(selection_report.page(chosen())).text
     for text in (terminal, page):
-        assert [fact for fact in FACTS if fact not in text] == []
+        assert [fact for fact in facts if fact not in text] == []
     text = selection_report.text(missed())
     page = selection_report.page(missed())
     for fact in (

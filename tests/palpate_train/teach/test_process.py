@@ -6,6 +6,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,6 @@ sys.exit(code)
 """
 LONG_S = 900
 """Limit of a process, far beyond its time on a loaded machine."""
-FORBIDDEN = {"torch", "sklearn", "pandas", "h5py", "joblib", "matplotlib", "skl2onnx", "aeon"}
 
 
 def run(code: str, *words: str | Path | int) -> subprocess.CompletedProcess[str]:
@@ -55,6 +55,7 @@ def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
 
 def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     """The recipe's without stages, and who taught it; three sweeps of something else are told."""
+    forbidden = {"torch", "sklearn", "pandas", "h5py", "joblib", "matplotlib", "skl2onnx", "aeon"}
     sweeps = easy(12)
     plain = replace(
         sweeps,
@@ -67,13 +68,13 @@ def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     code, (assessed,), loaded = ran(tmp_path / "sweeps")
     assert code == 0
     assert assessed["type"] == "assessed"
-    assert not loaded & FORBIDDEN
+    assert not loaded & forbidden
     out = tmp_path / "bundle"
     code, lines, loaded = ran(
         tmp_path / "sweeps", "--out", out, "--by", "anna", "--at", "today", "--memory-mb", "700"
     )
     assert code == 0, lines
-    assert not loaded & FORBIDDEN
+    assert not loaded & forbidden
     assert [one.get("step") for one in lines[:-1]] == ["features", "heads", "bundle"]
     made = bundle.load(out)
     held = {"high": 12, "low": 12, "middle": 12}
@@ -145,17 +146,6 @@ def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 
-LOOKED = """
-import sys
-from pathlib import Path
-from palpate_train.teach import __main__ as teach
-from palpate_train.data.run import Run
-teach.MEMINFO = Path(sys.argv.pop())
-code = teach.main(sys.argv[1:])
-sys.exit(9 if "numpy" in sys.modules else code)
-"""
-
-
 @pytest.mark.parametrize(
     ("free_mb", "limit_mb", "why"), [(4000, 100, "100 MB"), (50, 768, "50 MB"), (50, 0, "50 MB")]
 )
@@ -163,8 +153,17 @@ def test_too_little_memory_is_said_before_numpy_is_loaded(
     tmp_path: Path, free_mb: int, limit_mb: int, why: str
 ):
     """A library that is loaded without room may ask for memory for ever, so nothing is loaded."""
+    looked = dedent("""
+    import sys
+    from pathlib import Path
+    from palpate_train.teach import __main__ as teach
+    from palpate_train.data.run import Run
+    teach.MEMINFO = Path(sys.argv.pop())
+    code = teach.main(sys.argv[1:])
+    sys.exit(9 if "numpy" in sys.modules else code)
+    """)
     (tmp_path / "meminfo").write_text(f"MemFree: 3 kB\nMemAvailable: {free_mb << 10} kB\n")
-    done = run(LOOKED, tmp_path, "--memory-mb", limit_mb, tmp_path / "meminfo")
+    done = run(looked, tmp_path, "--memory-mb", limit_mb, tmp_path / "meminfo")
     assert done.returncode == 1, done.stderr
     assert json.loads(done.stdout)["type"] == "error"
     assert why in json.loads(done.stdout)["text"]

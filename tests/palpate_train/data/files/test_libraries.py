@@ -246,20 +246,18 @@ def test_a_recording_that_was_cut_off_says_how_to_mend_it(tmp_path: Path):
             assert mends in str(e.value)
 
 
-LABELS = ["wood"] * 15 + ["felt"] * 25
-
-
 @pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
 @pytest.mark.parametrize("late", [0, 5])
 def test_a_topic_of_texts_gives_labels(tmp_path: Path, kind: str, late: int):
     """The last text before a frame is its label; frames before the first text are left out."""
+    labels = ["wood"] * 15 + ["felt"] * 25
     name = tmp_path / ("a.bag" if kind == "bag" else "a")
-    texts = [""] * late + LABELS[late:]
+    texts = [""] * late + labels[late:]
     path = bag(name, kind, "std_msgs/msg/Float32MultiArray", texts)
     if kind != "bag":
         (path,) = path.glob(f"*.{kind}")
     found = raw_files.read(path, ReadPlan(fields=("/note", "note")))
-    assert found.labels["/note"] == found.labels["note"] == LABELS[late:]
+    assert found.labels["/note"] == found.labels["note"] == labels[late:]
     np.testing.assert_array_equal(found.values, SKIN[late:])
     np.testing.assert_allclose(found.vectors["received"], TIMES[late:])
     assert len(found.notes) == (late > 0)

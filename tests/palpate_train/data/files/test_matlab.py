@@ -21,7 +21,6 @@ scipy_io = Later("scipy.io")
 sparse = Later("scipy.sparse")
 
 SKIN = np.arange(40 * 4.0).reshape(40, 4)
-TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 
 
 def saved(path: Path, **values: object) -> Path:
@@ -33,8 +32,9 @@ def saved(path: Path, **values: object) -> Path:
 @pytest.mark.parametrize("version", ["4", "5"])
 def test_numbers_are_read_in_their_type(tmp_path: Path, version: str):
     """Beside a vector of times, a text, complex and sparse numbers, which are passed over."""
+    types = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
     others = {"who": "Ada", "z": SKIN * 1j, "t": np.arange(40.0), "s": sparse.eye(9)}
-    for kind in TYPES if version == "5" else ("f8", "f4", "i4", "i2", "u2", "u1"):
+    for kind in types if version == "5" else ("f8", "f4", "i4", "i2", "u2", "u1"):
         skin = (SKIN % 100).astype(kind)
         scipy_io.savemat(tmp_path / "a.mat", {"skin": skin} | others, format=version)
         found = raw_files.read(tmp_path / "a.mat", ReadPlan(time="t"))

@@ -36,18 +36,18 @@ TEXTS = {
     "rows": ("matrix", "# rows: 2\n# columns: 3\n 1 2 NA\n 4 5.5 NaN\n", "f8"),
     "single": ("float matrix", "# rows: 2\n# columns: 3\n 1 2 3\n 4 5.5 6\n", "f4"),
 }
-EXPECTED = {
-    "whole numbers": [[1, 2, 3], [4, 5, 6]],
-    "logical": [[1, 1, 1], [0, 0, 1]],
-    "rows": [[1, 2, np.nan], [4, 5.5, np.nan]],
-    "single": [[1, 2, 3], [4, 5.5, 6]],
-}
 
 
 @pytest.mark.parametrize("kind", TEXTS)
 @pytest.mark.parametrize("name", ["a.txt", "a.mat"])
 def test_text_has_its_types_and_shapes(tmp_path: Path, kind: str, name: str):
     """Also with a range, a name and a complex number in the file."""
+    expected = {
+        "whole numbers": [[1, 2, 3], [4, 5, 6]],
+        "logical": [[1, 1, 1], [0, 0, 1]],
+        "rows": [[1, 2, np.nan], [4, 5.5, np.nan]],
+        "single": [[1, 2, 3], [4, 5.5, 6]],
+    }
     octave, body, dtype = TEXTS[kind]
     path = tmp_path / name
     path.write_text(
@@ -57,7 +57,7 @@ def test_text_has_its_types_and_shapes(tmp_path: Path, kind: str, name: str):
         "# name: z\n# type: complex scalar\n(1,2)\n\n\n"
     )
     found = raw_files.read(path, ReadPlan(time="t"))
-    np.testing.assert_array_equal(found.values, np.array(EXPECTED[kind], dtype))
+    np.testing.assert_array_equal(found.values, np.array(expected[kind], dtype))
     assert found.values.dtype == dtype
     np.testing.assert_allclose(found.vectors["t"], [0, 0.2, 0.4, 0.6])
 

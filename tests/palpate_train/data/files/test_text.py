@@ -1,6 +1,7 @@
 """Text: each kind of table gives its numbers, or an error with line, cell and remedy."""
 
 import itertools
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -264,36 +265,35 @@ def test_a_text_without_numbers_shows_one_of_its_lines(text: str, shown: str):
         read(text)
 
 
-LVM = """LabVIEW Measurement\t
-Writer_Version\t2
-Reader_Version\t2
-Separator\tTab
-Decimal_Separator\t{0}
-Multi_Headings\tNo
-X_Columns\tOne
-Time_Pref\tAbsolute
-Date\t2026/01/31
-***End_of_Header***\t\t\t\t\t
-Channels\t4\t\t\t\t
-Samples\t30\t30\t30\t30\t
-Date\t2026/01/31\t2026/01/31\t2026/01/31\t2026/01/31\t
-X_Dimension\tTime\tTime\tTime\tTime\t
-X0\t0{0}0\t0{0}0\t0{0}0\t0{0}0\t
-Delta_X\t0{0}01\t0{0}01\t0{0}01\t0{0}01\t
-***End_of_Header***\t\t\t\t\t
-X_Value\ta\tb\tc\td\tComment
-"""
-
-
 @pytest.mark.parametrize("sign", [".", ","])
 @pytest.mark.parametrize("tail", ["", "\t"])
 def test_labviews_measurements_are_read(sign: str, tail: str):
     """Names from the line after the last header; the header states the decimal sign."""
+    lvm = dedent("""\
+    LabVIEW Measurement\t
+    Writer_Version\t2
+    Reader_Version\t2
+    Separator\tTab
+    Decimal_Separator\t{0}
+    Multi_Headings\tNo
+    X_Columns\tOne
+    Time_Pref\tAbsolute
+    Date\t2026/01/31
+    ***End_of_Header***\t\t\t\t\t
+    Channels\t4\t\t\t\t
+    Samples\t30\t30\t30\t30\t
+    Date\t2026/01/31\t2026/01/31\t2026/01/31\t2026/01/31\t
+    X_Dimension\tTime\tTime\tTime\tTime\t
+    X0\t0{0}0\t0{0}0\t0{0}0\t0{0}0\t
+    Delta_X\t0{0}01\t0{0}01\t0{0}01\t0{0}01\t
+    ***End_of_Header***\t\t\t\t\t
+    X_Value\ta\tb\tc\td\tComment
+    """)
     rows = "".join(
         f"{k / 100:.6f}".replace(".", sign) + "\t" + "\t".join(map(str, row)) + f"{tail}\n"
         for k, row in enumerate(ROWS)
     )
-    found = read(LVM.format(sign) + rows)
+    found = read(lvm.format(sign) + rows)
     assert found.columns == ("X_Value", "a", "b", "c", "d")
     np.testing.assert_array_equal(found.values[:, 1:], ROWS)
     np.testing.assert_allclose(found.values[:, 0], np.arange(30) / 100)

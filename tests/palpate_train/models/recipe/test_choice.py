@@ -14,7 +14,6 @@ from palpate_train.data.splitters import InnerPart
 from palpate_train.models.recipe import choice
 from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores
 
-Array = NDArray[np.float64]
 GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
 """Features that name the material everywhere; features without information; a feature that names it
 in one group and misleads in the others."""
@@ -309,6 +308,7 @@ def test_candidates_are_what_the_features_allow():
 def test_copies_are_drawn_and_chosen_where_sweeps_alone_do_not_suffice(drawn: bool):
     """Each place disturbs sweeps in its own way, which copies show in training; without
     disturbances nothing is drawn."""
+    Array = NDArray[np.float64]
     given, parts = known()
     rng, signal = np.random.default_rng(3), 2 * np.eye(3)[given.labels]
     place = np.eye(3)[np.arange(240) // 80] * drawn
@@ -373,18 +373,18 @@ def test_views_and_copies_stay_away_where_they_harm():
     assert not any(part.copies for part in choice.choose(at, heads, print).plan.parts)
 
 
-def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
-    """Scores of sweeps with one weak filter (0), and loads (1, 2) that name materials."""
-    given, parts = known(seed=seed)
-    x = given.features[:, [3, 0, 1]].copy()
-    x[:, 0] += 0.4 * given.features[:, 0]
-    own = replace(given, features=x, of_copies=lambda: x)
-    columns = candidates([[0]], [0], [0], loads=[1, 2]).columns
-    return HeldOutScores([own] * 3, parts, 3), columns
-
-
 def test_loads_join_where_held_out_groups_show_it():
     """Not in one session, and not where they mislead in the next."""
+
+    def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
+        """Scores of sweeps with one weak filter (0), and loads (1, 2) that name materials."""
+        given, parts = known(seed=seed)
+        x = given.features[:, [3, 0, 1]].copy()
+        x[:, 0] += 0.4 * given.features[:, 0]
+        own = replace(given, features=x, of_copies=lambda: x)
+        columns = candidates([[0]], [0], [0], loads=[1, 2]).columns
+        return HeldOutScores([own] * 3, parts, 3), columns
+
     at, columns = with_loads()
     joined = choice.choose(at, Candidates(columns, False, True), print)
     assert {1, 2} <= set(joined.plan.columns().tolist())

@@ -11,38 +11,42 @@ from palpate_train.models.recipe import loads
 from palpate_train.models.recipe.architectures import PREFIXES
 from palpate_train.onnx_tools.graph_builder import FLOAT, GraphBuilder, run
 
-SCALE = 0.5
-FORMATS = [
-    skin.FORMAT,
-    skin.SHEAR_FORMAT,
-    replace(skin.FORMAT, window=83, dtype="uint16"),
-    replace(skin.FORMAT, window=16, rows=1, cols=1),
-]
 
-
-def features(format: SweepFormat, samples: np.ndarray, prefixes: bool) -> np.ndarray:
-    """The loads of raw counts, by a graph that has nothing else."""
-    g, rows, size = GraphBuilder(), PREFIXES if prefixes else 1, loads.count(format)
-    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
-    found = loads.nodes(g, g("Cast", raw, to=FLOAT), format, SCALE, prefixes)
-    shape = (rows, size) if prefixes else (size,)
-    g("Reshape", found, g.constant([1, *shape], "int64"), output="features")
-    return run(g.model(format, "features", *shape), samples)
-
-
-def expected(format: SweepFormat, samples: np.ndarray, end: int) -> np.ndarray:
-    """The same by numpy, of the first `end` frames."""
-    x = samples.reshape(len(samples), format.window, -1) * SCALE
-    total = x.reshape(len(x), format.window, -1, format.axes).mean(axis=2)
-    tenth = max(format.window // PREFIXES, 1)
-    mean = total[:, :end].mean(axis=1)
-    first, last = total[:, :tenth].mean(axis=1), total[:, max(end - tenth, 0) : end].mean(axis=1)
-    return np.hstack([x[:, :end].mean(axis=1), first - mean, last - mean])
-
-
-@pytest.mark.parametrize("format", FORMATS, ids=str)
+@pytest.mark.parametrize(
+    "format",
+    [
+        skin.FORMAT,
+        skin.SHEAR_FORMAT,
+        replace(skin.FORMAT, window=83, dtype="uint16"),
+        replace(skin.FORMAT, window=16, rows=1, cols=1),
+    ],
+    ids=str,
+)
 def test_means_and_movements_are_those_of_the_window(format: SweepFormat) -> None:
     """Also of each prefix, which depends on no frame after it."""
+    scale = 0.5
+
+    def expected(format: SweepFormat, samples: np.ndarray, end: int) -> np.ndarray:
+        """The same by numpy, of the first `end` frames."""
+        x = samples.reshape(len(samples), format.window, -1) * scale
+        total = x.reshape(len(x), format.window, -1, format.axes).mean(axis=2)
+        tenth = max(format.window // PREFIXES, 1)
+        mean = total[:, :end].mean(axis=1)
+        first, last = (
+            total[:, :tenth].mean(axis=1),
+            total[:, max(end - tenth, 0) : end].mean(axis=1),
+        )
+        return np.hstack([x[:, :end].mean(axis=1), first - mean, last - mean])
+
+    def features(format: SweepFormat, samples: np.ndarray, prefixes: bool) -> np.ndarray:
+        """The loads of raw counts, by a graph that has nothing else."""
+        g, rows, size = GraphBuilder(), PREFIXES if prefixes else 1, loads.count(format)
+        raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
+        found = loads.nodes(g, g("Cast", raw, to=FLOAT), format, scale, prefixes)
+        shape = (rows, size) if prefixes else (size,)
+        g("Reshape", found, g.constant([1, *shape], "int64"), output="features")
+        return run(g.model(format, "features", *shape), samples)
+
     rng = np.random.default_rng(0)
     drift = np.linspace(0, 60, format.window)[:, None, None]
     shape = (3, format.window, format.rows, format.cols)

@@ -17,31 +17,30 @@ from tests.factories.sweep_sets import easy
 USED = 120
 
 
-def repeated(times: int) -> Dataset:
-    """The easy set several times, each time with other recordings and other noise."""
-    s, rng = easy(20), np.random.default_rng(0)
-    samples = np.concatenate([s.samples] * times)
-    noisy = samples + rng.integers(-2, 3, samples.shape)
-    limits = np.iinfo(samples.dtype)
-    groups = {"recording": np.arange(len(samples)) // 2}
-    noisy = noisy.clip(limits.min, limits.max).astype(samples.dtype)
-    return replace(s, samples=noisy, labels=np.tile(s.labels, times), groups=groups)
-
-
-def peak(sweeps: Dataset) -> int:
-    """The largest number of bytes that a fit to USED of these sweeps allocates beside them."""
-    tracemalloc.start()
-    try:
-        recipe.fit(sweeps, Run(1), Settings(most=USED))
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.slow
 @pytest.mark.thorough  # fits twice
 def test_memory_does_not_grow_with_the_set():
     """Thirty times the sweeps take as much beside themselves, within the estimate."""
+
+    def peak(sweeps: Dataset) -> int:
+        """The largest number of bytes that a fit to USED of these sweeps allocates beside them."""
+        tracemalloc.start()
+        try:
+            recipe.fit(sweeps, Run(1), Settings(most=USED))
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    def repeated(times: int) -> Dataset:
+        """The easy set several times, each time with other recordings and other noise."""
+        s, rng = easy(20), np.random.default_rng(0)
+        samples = np.concatenate([s.samples] * times)
+        noisy = samples + rng.integers(-2, 3, samples.shape)
+        limits = np.iinfo(samples.dtype)
+        groups = {"recording": np.arange(len(samples)) // 2}
+        noisy = noisy.clip(limits.min, limits.max).astype(samples.dtype)
+        return replace(s, samples=noisy, labels=np.tile(s.labels, times), groups=groups)
+
     small, large = repeated(3), repeated(90)
     least, most = peak(small), peak(large)
     assert most < 1.1 * least + 64 * len(large), (least, most)  # 64: groups and labels

@@ -33,7 +33,6 @@ checkpoint = Later("palpate_train.models.checkpoint")
 stages = Later("palpate_train.models.recipe.stages")
 
 CLOSED = Settings()
-INTERRUPTED = 130
 
 
 @pytest.fixture(scope="module")
@@ -192,15 +191,16 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
         assert np.mean(logits.argmax(axis=1) == easy().labels) > 0.9
 
 
-def uncalibrated(given: object) -> NoReturn:
-    """As if too few sweeps judged; a calibration would take longer than the fit."""
-    raise FormatError("not here")
-
-
 @pytest.mark.slow
 @pytest.mark.thorough  # fits three times
 def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With the bits of an uninterrupted one; another seed begins anew."""
+
+    def uncalibrated(given: object) -> NoReturn:
+        """As if too few sweeps judged; a calibration would take longer than the fit."""
+        raise FormatError("not here")
+
+    interrupted = 130
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
     monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
@@ -218,7 +218,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def fitted(name: str, seed: int = 1) -> Fit | None:
         out = tmp_path / f"{name}.npz"
         args = f"--set {tmp_path / 'easy.npz'} --seed {seed} --stages 12 --out {out}".split()
-        assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
+        assert main(["fit", *args]) == (0 if stop < 0 else interrupted)
         return Fit.load(out) if stop < 0 else None
 
     monkeypatch.setattr(stages.StagesNetwork, "backward", backward)

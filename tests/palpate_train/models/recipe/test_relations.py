@@ -23,13 +23,6 @@ from tests.factories.trunk import view
 
 SCALE = 0.05
 SLOW = replace(skin.FORMAT, window=128, rows=16, cols=1, dtype="int16")
-FORMATS = [
-    skin.FORMAT,
-    skin.SHEAR_FORMAT,
-    SLOW,
-    replace(skin.FORMAT, window=83, rows=2, cols=1, dtype="uint16"),
-]
-LARGE = replace(skin.FORMAT, window=40, rows=16, cols=32)
 
 
 def features(format: SweepFormat, samples: np.ndarray, used: int, prefixes: bool) -> np.ndarray:
@@ -64,7 +57,16 @@ def woven(format: SweepFormat, rng: np.random.Generator, n: int = 2) -> np.ndarr
     return np.rint(100 + own + shared + drift).clip(0, 250).astype(format.numpy_type)
 
 
-@pytest.mark.parametrize("format", FORMATS, ids=str)
+@pytest.mark.parametrize(
+    "format",
+    [
+        skin.FORMAT,
+        skin.SHEAR_FORMAT,
+        SLOW,
+        replace(skin.FORMAT, window=83, rows=2, cols=1, dtype="uint16"),
+    ],
+    ids=str,
+)
 def test_they_are_the_deviations_and_correlations_of_the_window(format: SweepFormat) -> None:
     """Also of each prefix, which depends on no frame after it."""
     samples, used = woven(format, np.random.default_rng(0)), relations.scales(format)
@@ -104,11 +106,12 @@ def test_few_scales_are_the_first_and_silence_is_finite():
 
 def test_a_large_skin_is_divided_into_cells():
     """Sixteen by 32 taxels have three by eight cells: the mean of a cell's taxels is a channel."""
-    samples = woven(LARGE, np.random.default_rng(3))
-    assert relations.each(LARGE) == 24 + 24 * 23 // 2
+    large = replace(skin.FORMAT, window=40, rows=16, cols=32)
+    samples = woven(large, np.random.default_rng(3))
+    assert relations.each(large) == 24 + 24 * 23 // 2
     row, col = np.arange(16) * 3 // 16, np.arange(32) * 8 // 32
     cell = row[:, None] * 8 + col
-    for sweep, found in zip(samples, features(LARGE, samples, 2, False), strict=True):
+    for sweep, found in zip(samples, features(large, samples, 2, False), strict=True):
         means = np.stack([sweep[:, cell == n].mean(axis=1) for n in range(24)], axis=1) * SCALE
         np.testing.assert_allclose(found, expected(means, 2, 40, 1), atol=2e-3)
 
