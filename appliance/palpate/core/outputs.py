@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-Row = tuple[str, str, dict[str, Any]]
+Row = tuple[str, str | None, Mapping[str, Any]]
 """An option: its flag, its help, and the rest as argparse has it."""
 
 OF_FILES = (
@@ -22,9 +22,13 @@ def add_options(command: ArgumentParser, names: str, table: Mapping[str, Row]) -
     """Add options by their names in `table`; names with | between them exclude each other."""
     for word in names.split():
         group: Any = command.add_mutually_exclusive_group() if "|" in word else command
-        for name in word.split("|"):
-            flag, help, how = table[name]
-            group.add_argument(flag, help=help, **how)
+        add_rows(group, *(table[name] for name in word.split("|")))
+
+
+def add_rows(command: Any, *rows: Row) -> None:
+    """Add options to a parser or a group."""
+    for flag, help, how in rows:
+        command.add_argument(flag, help=help, **how)
 
 
 def folder(text: str) -> Path:

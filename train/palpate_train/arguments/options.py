@@ -13,6 +13,7 @@ from typing import Any
 
 from palpate.core import outputs
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.text import printable, say
 from palpate_train.arguments import numbers
 from palpate_train.data import labels, readers, sets
@@ -27,92 +28,59 @@ SET_FILES = (".npz", *readers.HDF5)
 LOG_EVERY_S = 30
 
 
-def add_set(command: argparse.ArgumentParser, usual: str = "", required: bool = True) -> None:
-    """Add --set, --only and --rename. usual: the default set; without it --set is required, unless
-    the command checks that itself (`required` is False)."""
-    told = f"{SET} ({usual})" if usual else SET
-    required = required and not usual
-    command.add_argument(
-        "--set", action="append", required=required, metavar="SET", dest="sets", help=told
-    )
-    command.set_defaults(usual_set=usual)
-    command.add_argument(
-        "--only",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="NAME=VALUE",
-        help="keep these sweeps: force=100,150, force<=180, material=Canvas,Linen",
-    )
-    add_rename(command)
-
-
-def add_seed(command: argparse.ArgumentParser) -> None:
-    """Add --seed."""
-    command.add_argument(
-        "--seed",
-        type=numbers.whole("--seed", 0),
-        required=True,
-        help="seed of the training, and of simulated sets without one",
-    )
-
-
-def add_rename(command: argparse.ArgumentParser) -> None:
-    """Add --rename."""
-    command.add_argument(
-        "--rename",
-        action="append",
-        default=[],
-        metavar="OLD=NEW",
-        help="rename a material, before --only; two with the same new name become one",
-    )
-
-
-def add_effort(command: argparse.ArgumentParser) -> None:
-    """Add options for the length of trainings."""
-    usual = methods.FULL_EFFORT
-    command.add_argument(
-        "--effort",
-        type=numbers.above_zero("--effort"),
-        default=usual.share,
-        metavar="SHARE",
-        help="share of the networks' usual iterations (1)",
-    )
-
-
-def add_where(command: argparse.ArgumentParser) -> None:
-    """Add options for where tasks run and where their results are kept."""
-    add_jobs(command)
-    command.add_argument(
-        "--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks"
-    )
-    command.add_argument(
-        "--cache",
-        type=Path,
-        default=evaluate.CACHE,
-        metavar="DIR",
-        help=(
-            "where finished folds are kept, so that an interrupted run continues "
-            f"({evaluate.CACHE})"
-        ),
-    )
-
-
-def add_jobs(command: argparse.ArgumentParser) -> None:
-    """Add --jobs."""
-    command.add_argument(
-        "--jobs", type=jobs, default=-1, metavar="N", help="processes (one for each core)"
-    )
-
-
 def jobs(text: str) -> int:
     """Read --jobs: processes from 1 on, or -1 for one on each core. Raises FormatError."""
     return -1 if text == "-1" else numbers.whole("--jobs", 1)(text)
 
 
-def add_folder(command: argparse.ArgumentParser, about: str | None = None) -> None:
+def text(metavar: str, default: Any = None, **more: Any) -> dict[str, Any]:
+    """An option that is a text."""
+    return {"metavar": metavar, "default": default, **more}
+
+
+def path(metavar: str = "FILE", **more: Any) -> dict[str, Any]:
+    """An option that is a path."""
+    return {"type": Path, "metavar": metavar, **more}
+
+
+def above_zero(flag: str, metavar: str, help: str, **more: Any) -> Row:
+    """An option that is a number above 0."""
+    return flag, help, text(metavar, type=numbers.above_zero(flag), **more)
+
+
+# fmt: off
+FLAG = {"action": "store_true"}
+JSON: Row = "--json", "write the figures there", path()
+SEED: Row = ("--seed", "seed of the training, and of simulated sets without one",
+    {"type": numbers.whole("--seed", 0), "required": True})
+ONLY: Row = ("--only", "keep these sweeps: force=100,150, force<=180, material=Canvas,Linen",
+    text("NAME=VALUE", [], action="extend", nargs="+"))
+RENAME: Row = ("--rename", "rename a material, before --only; two with the same new name become"
+    " one", text("OLD=NEW", action="append", default=[]))
+EFFORT = above_zero("--effort", "SHARE", "share of the networks' usual iterations"
+    " (1)", default=methods.FULL_EFFORT.share)
+WHERE: tuple[Row, ...] = (
+    ("--jobs", "processes (one for each core)", {"type": jobs, "default": -1, "metavar": "N"}),
+    ("--scheduler", "of a Dask cluster that runs the tasks", text("ADDRESS", "")),
+    ("--cache", "where finished folds are kept, so that an interrupted run continues"
+        f" ({evaluate.CACHE})", path("DIR", default=evaluate.CACHE)),
+)
+"""Options for where tasks run and where their results are kept."""
+# fmt: on
+
+
+def add_set(command: argparse.ArgumentParser, usual: str = "", required: bool = True) -> None:
+    """Add --set, --only and --rename. usual: the default set; without it --set is required, unless
+    the command checks that itself (`required` is False)."""
+    told = f"{SET} ({usual})" if usual else SET
+    many = {"action": "append", "required": required and not usual, "dest": "sets"}
+    command.set_defaults(usual_set=usual)
+    add_rows(command, ("--set", told, text("SET", **many)), ONLY, RENAME)
+
+
+def folder(about: str) -> Row:
     """The option --out, a folder."""
-    command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR", help=about)
+    return "--out", about, {"type": outputs.folder, "required": True, "metavar": "DIR"}
 
 
 def writable(path: Path, option: str = "--out") -> None:

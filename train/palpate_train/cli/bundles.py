@@ -13,6 +13,7 @@ from palpate.bundle.manifest import Manifest
 from palpate.core import config, settings_files
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate.core.sweep_set import read
@@ -28,6 +29,7 @@ from palpate_train.answer import (
     stranger_limits,
 )
 from palpate_train.arguments import numbers, options
+from palpate_train.arguments.options import above_zero, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import repeats, sets
 from palpate_train.export import measure, pack, quantized_bundle
@@ -37,58 +39,38 @@ from palpate_train.models.recipe.fitted import WHAT, Fit
 from palpate_train.reports import formatting
 
 
+def _rules(option: str, into: str, what: str) -> Row:
+    names = {"nargs": "+", "action": "extend", "choices": tuple(rules.RULES)}
+    return option, f"{what}: {', '.join(rules.RULES)}", text("NAME", [], dest=into, **names)
+
+
+# fmt: off
+_EXPORT: tuple[Row, ...] = (
+    ("fit", "what palpate-train fit wrote", path("FIT")),
+    options.folder("the bundle; replaced if it is there"),
+    ("--name", None, {"required": True}),
+    ("--version", None, {"required": True}),
+    ("--full-scale", "the skin's highest raw count (default: the maximum of its type)",
+        {"type": numbers.above_zero("--full-scale")}),
+    ("--pitch-mm", "distance between taxels; without it `palpate skin align` cannot show mm (known"
+        " for the simulated skin)", {"type": numbers.above_zero("--pitch-mm")}),
+    _rules("--with", "kept", "keep these rules even if they do not pay"),
+    _rules("--without", "left_out", "leave these rules out"),
+    ("--licence", "of the recordings, for card.md: CC-BY-4.0", text("NAME", "")),
+    above_zero("--stranger-cost", "N", "cost of an unknown material that gets a"
+        " label, as a multiple of that of a known one that gets none (1)", default=1.0),
+)
+# fmt: on
+
+
 def register(add: Add) -> None:
     """export and score."""
-    _add_export(add("export", run_export))
+    add_rows(add("export", run_export), *_EXPORT)
     score = add("score", run_score)
-    score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
+    add_rows(score, ("bundle", "its folder", path("BUNDLE")))
     options.add_set(score)
-    _add_rules(score, "--without", "left_out", "score the bundle without these rules, too")
-    score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-
-
-def _add_export(export: argparse.ArgumentParser) -> None:
-    export.add_argument("fit", type=Path, metavar="FIT", help="what palpate-train fit wrote")
-    options.add_folder(export, "the bundle; replaced if it is there")
-    export.add_argument("--name", required=True)
-    export.add_argument("--version", required=True)
-    export.add_argument(
-        "--full-scale",
-        type=numbers.above_zero("--full-scale"),
-        help="the skin's highest raw count (default: the maximum of its type)",
-    )
-    export.add_argument(
-        "--pitch-mm",
-        type=numbers.above_zero("--pitch-mm"),
-        help="distance between taxels; without it `palpate skin align` cannot show mm (known for "
-        "the simulated skin)",
-    )
-    _add_rules(export, "--with", "kept", "keep these rules even if they do not pay")
-    _add_rules(export, "--without", "left_out", "leave these rules out")
-    export.add_argument(
-        "--licence", default="", metavar="NAME", help="of the recordings, for card.md: CC-BY-4.0"
-    )
-    export.add_argument(
-        "--stranger-cost",
-        type=numbers.above_zero("--stranger-cost"),
-        default=1.0,
-        metavar="N",
-        help="cost of an unknown material that gets a label, as a multiple of that of a known one "
-        "that gets none (1)",
-    )
-
-
-def _add_rules(command: argparse.ArgumentParser, option: str, into: str, what: str) -> None:
-    command.add_argument(
-        option,
-        dest=into,
-        nargs="+",
-        action="extend",
-        default=[],
-        choices=tuple(rules.RULES),
-        metavar="NAME",
-        help=f"{what}: {', '.join(rules.RULES)}",
-    )
+    less = _rules("--without", "left_out", "score the bundle without these rules, too")
+    add_rows(score, less, options.JSON)
 
 
 def run_export(args: argparse.Namespace) -> None:

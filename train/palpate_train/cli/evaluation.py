@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
 from palpate.core.text import say
 from palpate_train.arguments import options
+from palpate_train.arguments.options import EFFORT, FLAG, WHERE, path
 from palpate_train.arguments.program import Add
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, set_warnings, trivial
@@ -27,60 +29,30 @@ class ListMethods(argparse.Action):
         parser.exit()
 
 
+# fmt: off
+_OPTIONS: tuple[Row, ...] = (
+    ("--protocol", "random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups"
+        " out", options.text("PROTOCOL", action="append", required=True, dest="protocols")),
+    ("--method", "or all; see --list", options.text("NAME[,NAME...]", required=True)),
+    ("--remove-means", "subtract the mean of each taxel in each window", FLAG),
+    ("--label-alone", "leave out the answers of the box, which take most of the time", FLAG),
+    ("--seeds", "seeds of training and random folds: 1 to N (1)", options.text("N", 1, type=int)),
+    ("--each", "train on N sweeps of each material, drawn by the seed: a point of a learning curve"
+        " (all)", options.text("N", 0, type=int)),
+    ("--json", "write the results there", path()),
+    EFFORT,
+    *WHERE,
+)
+# fmt: on
+
+
 def register(add: Add) -> None:
     """evaluate."""
     command = add("evaluate", run_evaluate)
-    command.add_argument(
-        "--list",
-        action=ListMethods,
-        nargs=0,
-        help="the methods that --method takes, and nothing else",
-    )
+    listed = "the methods that --method takes, and nothing else"
+    add_rows(command, ("--list", listed, {"action": ListMethods, "nargs": 0}))
     options.add_set(command)
-    _add_grid(command)
-    command.add_argument("--json", type=Path, metavar="FILE", help="write the results there")
-    options.add_effort(command)
-    options.add_where(command)
-
-
-def _add_grid(command: argparse.ArgumentParser) -> None:
-    """Options for the protocols, methods and seeds."""
-    command.add_argument(
-        "--protocol",
-        action="append",
-        required=True,
-        metavar="PROTOCOL",
-        dest="protocols",
-        help="random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups out",
-    )
-    command.add_argument(
-        "--method", required=True, metavar="NAME[,NAME...]", help="or all; see --list"
-    )
-    command.add_argument(
-        "--remove-means", action="store_true", help="subtract the mean of each taxel in each window"
-    )
-    command.add_argument(
-        "--label-alone",
-        action="store_true",
-        help="leave out the answers of the box, which take most of the time",
-    )
-    command.add_argument(
-        "--seeds",
-        type=int,
-        default=1,
-        metavar="N",
-        help="seeds of training and random folds: 1 to N (1)",
-    )
-    command.add_argument(
-        "--each",
-        type=int,
-        default=0,
-        metavar="N",
-        help=(
-            "train on N sweeps of each material, drawn by the seed: a point of a learning "
-            "curve (all)"
-        ),
-    )
+    add_rows(command, *_OPTIONS)
 
 
 def method_lines() -> Iterator[str]:

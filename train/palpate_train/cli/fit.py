@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
 from palpate.core.text import say
 from palpate_train.answer import stranger_limits
 from palpate_train.arguments import numbers, options, scene_file
+from palpate_train.arguments.options import EFFORT, FLAG, SEED, above_zero, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, labels
 from palpate_train.data.group_values import text_of
@@ -44,134 +46,53 @@ MAINS = (50, 60)
 STEPS, MOST = recipe.STAGE_STEPS, memory.MOST_SWEEPS
 
 
+# fmt: off
+_OPTIONS: tuple[Row, ...] = (
+    ("--scene", "options in a file, as docs/choose/tubes.toml", path()),
+    SEED,
+    ("--out", "where the fit goes (.npz)", path("FIT", required=True)),
+    ("--split", "train on this share of a group, e.g. recording:0.7", text("GROUP:SHARE")),
+    ("--rest", "write what --split left out as a sweep set", path()),
+    ("--varies", "groups that will have other values in service, e.g. force,speed; each is held"
+        " out for the limits and for the printed accuracy (default: all that can be)",
+        text("GROUP,...", (), type=lambda text: tuple(text.split(",")))),
+    ("--most-sweeps", "largest number of sweeps that the model is fitted to; of more, some of each"
+        f" recording are drawn (default {MOST}); memory and time grow with it",
+        text("N", MOST, type=numbers.whole("--most-sweeps", 1))),
+    ("--method", "train this method instead of our recipe; see palpate-train evaluate --list",
+        text("NAME")),
+    EFFORT,
+    ("--reattached", "the skin will be taken off and put back after the recordings: train all heads"
+        " on augmented copies of that, too", FLAG),
+    ("--mains", f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}; the"
+        f" features ignore its hum (default {SkinUse().mains_hz:g})",
+        text("HZ", int(SkinUse().mains_hz), type=int, choices=MAINS)),
+    ("--stages", f"train stages, too ({STEPS} steps), and let them join where held-out sweeps show"
+        " a gain; takes most of the time",
+        text("STEPS", 0, type=numbers.whole("--stages", 1), nargs="?", const=STEPS, dest="steps")),
+    ("--size", "; ".join(f"{name}: at most {size.about}" for name, size in SIZES.items())
+        + " (default: no limit)", {"choices": SIZES}),
+    above_zero("--budget-ms", "MS", "processor time of a sweep on the board: choose"
+        " the smallest size that suffices within this"),
+    above_zero("--budget-kb", "KB", "size of the bundle in 1000 bytes: choose the"
+        " smallest size that suffices within this"),
+    above_zero("--slower", "TIMES", "assumed time on the board as a multiple of the"
+        " time here (1)"),
+    ("--accuracy", "choose the smallest size that reaches this on held-out sweeps",
+        text("SHARE", type=numbers.number("--accuracy", lambda x: 0 < x <= 1, "above 0, to 1"))),
+    ("--reduce", f"show how much less suffices, of {', '.join(reduction_curves.REDUCTIONS)}; the"
+        " fit has the shorter window, the others need another sensor",
+        text("WHAT", nargs="+", choices=reduction_curves.REDUCTIONS)),
+)
+# fmt: on
+
+
 def register(add: Add) -> None:
     """fit."""
     command = add("fit", run_fit)
     command.set_defaults(resumes=True, parser=command)
     options.add_set(command, required=False)
-    command.add_argument(
-        "--scene", type=Path, metavar="FILE", help="options in a file, as docs/choose/tubes.toml"
-    )
-    options.add_seed(command)
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
-    )
-    command.add_argument(
-        "--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7"
-    )
-    command.add_argument(
-        "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
-    )
-    command.add_argument(
-        "--varies",
-        type=lambda text: tuple(text.split(",")),
-        default=(),
-        metavar="GROUP,...",
-        help="groups that will have other values in service, e.g. force,speed; each is held out "
-        "for the limits and for the printed accuracy (default: all that can be)",
-    )
-    command.add_argument(
-        "--most-sweeps",
-        type=numbers.whole("--most-sweeps", 1),
-        default=MOST,
-        metavar="N",
-        help="largest number of sweeps that the model is fitted to; of more, some of each "
-        f"recording are drawn (default {MOST}); memory and time grow with it",
-    )
-    _add_method(command)
-    _add_use(command)
-    _add_dial(command)
-
-
-def _add_method(command: argparse.ArgumentParser) -> None:
-    """Options for another method than our recipe."""
-    command.add_argument(
-        "--method",
-        metavar="NAME",
-        help="train this method instead of our recipe; see palpate-train evaluate --list",
-    )
-    options.add_effort(command)
-
-
-def _add_use(command: argparse.ArgumentParser) -> None:
-    """Options for the use of the skin."""
-    command.add_argument(
-        "--reattached",
-        action="store_true",
-        help=(
-            "the skin will be taken off and put back after the recordings: train all heads on "
-            "augmented copies of that, too"
-        ),
-    )
-    command.add_argument(
-        "--mains",
-        type=int,
-        choices=MAINS,
-        default=int(SkinUse().mains_hz),
-        metavar="HZ",
-        help=(
-            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}; the "
-            f"features ignore its hum (default {SkinUse().mains_hz:g})"
-        ),
-    )
-
-
-def _add_dial(command: argparse.ArgumentParser) -> None:
-    """Options for the size of the model."""
-    command.add_argument(
-        "--stages",
-        type=numbers.whole("--stages", 1),
-        nargs="?",
-        const=STEPS,
-        default=0,
-        metavar="STEPS",
-        dest="steps",
-        help=f"train stages, too ({STEPS} steps), and let them join where held-out sweeps show a "
-        "gain; takes most of the time",
-    )
-    command.add_argument(
-        "--size",
-        choices=SIZES,
-        help="; ".join(f"{name}: at most {size.about}" for name, size in SIZES.items())
-        + " (default: no limit)",
-    )
-    _add_wish(command)
-
-
-def _add_wish(command: argparse.ArgumentParser) -> None:
-    """Options for the smallest size that suffices."""
-    for option, unit, what in (
-        ("--budget-ms", "MS", "processor time of a sweep on the board"),
-        ("--budget-kb", "KB", "size of the bundle in 1000 bytes"),
-    ):
-        command.add_argument(
-            option,
-            type=numbers.above_zero(option),
-            metavar=unit,
-            help=f"{what}: choose the smallest size that suffices within this",
-        )
-    command.add_argument(
-        "--slower",
-        type=numbers.above_zero("--slower"),
-        metavar="TIMES",
-        help="assumed time on the board as a multiple of the time here (1)",
-    )
-    command.add_argument(
-        "--accuracy",
-        type=numbers.number("--accuracy", lambda x: 0 < x <= 1, "above 0, to 1"),
-        metavar="SHARE",
-        help="choose the smallest size that reaches this on held-out sweeps",
-    )
-    command.add_argument(
-        "--reduce",
-        nargs="+",
-        choices=reduction_curves.REDUCTIONS,
-        metavar="WHAT",
-        help=(
-            f"show how much less suffices, of {', '.join(reduction_curves.REDUCTIONS)}; the fit "
-            "has the shorter window, the others need another sensor"
-        ),
-    )
+    add_rows(command, *_OPTIONS)
 
 
 def run_fit(args: argparse.Namespace) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
 from palpate.core.text import printable, say
 from palpate.core.types import DATA_TYPES
-from palpate_train.arguments import numbers, options
+from palpate_train.arguments import options
+from palpate_train.arguments.options import FLAG, above_zero, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import label_table, labels, lerobot, summary
 from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
@@ -21,72 +22,41 @@ from palpate_train.data.importing import Imported, LeftOutFile, Taken, check_fol
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
 
-OPTIONS = {
-    "--grid": ("ROWSxCOLUMNS[xAXES]", "how the columns lie: 4x4, 5x3x3"),
-    "--columns": (
-        "COLUMNS",
-        "columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
-    ),
-    "--variable": (
-        "NAME",
-        "the array to read if a file holds several; with a pattern, each that matches is a "
-        "recording: '{material}_{trial:d}'",
-    ),
-    "--axes": ("AXES", "the axes of an array in their order: row,column,frame"),
-    "--decimal": ("SIGN", "the decimal sign of texts, . or ,"),
-    "--dtype": (
-        "TYPE",
-        f"type of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)",
-    ),
-    "--time": ("COLUMN:UNIT", "the sampling times, in s, ms, us, ns, min, h or d: t:ms, 1:s"),
-    "--every": (
-        "LENGTH",
-        "cut windows from the start on, one each LENGTH (the middle window alone)",
-    ),
-}
-"""Options that are texts, "" without them."""
-FILES = {
-    "--labels": "a table of the files and their fields; its first line: file,material,position",
-    "--report": "a line for each file, imported or not",
-}
+# fmt: off
+_OPTIONS: tuple[Row, ...] = (
+    ("folder", "the recordings, in all folders below it", path("FOLDER")),
+    ("--pattern", f"meaning of the names below FOLDER: {EXAMPLE},"
+        " '{material}/{speed}/{}.csv'", text("PATTERN")),
+    ("--field", "a column that holds a field of each frame: material=label, session=date",
+        text("NAME=COLUMN", action="append", default=[])),
+    ("--out", "the sweep set (.npz, .h5)", path("SET", required=True)),
+    ("--labels", "a table of the files and their fields; its first line: file,material,position",
+        path()),
+    ("--report", "a line for each file, imported or not", path()),
+    ("--transpose", "arrays are taxels x frames", FLAG),
+    ("--grid", "how the columns lie: 4x4, 5x3x3", text("ROWSxCOLUMNS[xAXES]", "")),
+    ("--columns", "columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
+        text("COLUMNS", "")),
+    ("--variable", "the array to read if a file holds several; with a pattern, each that matches is"
+        " a recording: '{material}_{trial:d}'", text("NAME", "")),
+    ("--axes", "the axes of an array in their order: row,column,frame", text("AXES", "")),
+    ("--decimal", "the decimal sign of texts, . or ,", text("SIGN", "")),
+    ("--dtype", f"type of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that"
+        " holds all)", text("TYPE", "")),
+    ("--time", "the sampling times, in s, ms, us, ns, min, h or d: t:ms, 1:s",
+        text("COLUMN:UNIT", "")),
+    ("--every", "cut windows from the start on, one each LENGTH (the middle window alone)",
+        text("LENGTH", "")),
+    above_zero("--rate", "HZ", "frames per second"),
+    ("--window", "length of a sweep: 2s, 500ms or 1500 frames (2s)", text("LENGTH", "2s")),
+    options.RENAME,
+)
+# fmt: on
 
 
 def register(add: Add) -> None:
     """Add the command import."""
-    command = add("import", run)
-    command.add_argument(
-        "folder", type=Path, metavar="FOLDER", help="the recordings, in all folders below it"
-    )
-    command.add_argument(
-        "--pattern",
-        metavar="PATTERN",
-        help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
-    )
-    command.add_argument(
-        "--field",
-        action="append",
-        default=[],
-        metavar="NAME=COLUMN",
-        help="a column that holds a field of each frame: material=label, session=date",
-    )
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
-    )
-    for option, text in FILES.items():
-        command.add_argument(option, type=Path, metavar="FILE", help=text)
-    command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
-    for option, (metavar, text) in OPTIONS.items():
-        command.add_argument(option, default="", metavar=metavar, help=text)
-    command.add_argument(
-        "--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second"
-    )
-    command.add_argument(
-        "--window",
-        default="2s",
-        metavar="LENGTH",
-        help="length of a sweep: 2s, 500ms or 1500 frames (2s)",
-    )
-    options.add_rename(command)
+    add_rows(add("import", run), *_OPTIONS)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -9,10 +9,12 @@ import sys
 import tempfile
 from pathlib import Path
 
+from palpate.core.outputs import add_rows
 from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate.core.text import say
 from palpate_train.arguments import options
+from palpate_train.arguments.options import EFFORT, FLAG, WHERE, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, sets
 from palpate_train.data.progress import StageLine, StepTimes, spoken
@@ -25,32 +27,19 @@ SHARES = {"export": 0.21, "answers": 0.30, "trainings": 0.41, "pictures": 0.08}
 
 def register(add: Add) -> None:
     report = add("report", run_report)
-    report.add_argument(
-        "bundle",
-        type=Path,
-        metavar="BUNDLE|FIT",
-        help="its folder, or what palpate-train fit wrote",
-    )
+    wanted = "its folder, or what palpate-train fit wrote"
+    add_rows(report, ("bundle", wanted, path("BUNDLE|FIT")))
     options.add_set(report)
-    report.add_argument("--out", type=Path, required=True, metavar="FILE.html")
-    report.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    report.add_argument(
-        "--train",
-        action="append",
-        default=[],
-        metavar="SET",
-        help=(
-            "the set it was fitted to, for a learning curve, and to leave each material out "
-            "(those of a FIT)"
-        ),
+    # fmt: off
+    add_rows(report,
+        ("--out", None, path("FILE.html", required=True)),
+        options.JSON,
+        ("--train", "the set it was fitted to, for a learning curve, and to leave each material out"
+            " (those of a FIT)", text("SET", action="append", default=[])),
+        ("--quick", "train nothing: no learning curve, no material left out", FLAG),
+        EFFORT, *WHERE,
     )
-    report.add_argument(
-        "--quick",
-        action="store_true",
-        help="train nothing: no learning curve, no material left out",
-    )
-    options.add_effort(report)
-    options.add_where(report)
+    # fmt: on
 
 
 def run_report(args: argparse.Namespace) -> None:

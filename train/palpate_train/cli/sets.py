@@ -3,79 +3,63 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
 from palpate.core.text import say
 from palpate_train.arguments import numbers, options
-from palpate_train.arguments.program import Add
+from palpate_train.arguments.options import path, text
+from palpate_train.arguments.program import Add, Run
 from palpate_train.data import extras, lerobot_writer, mcap_writer, pull, sets, summary
 from palpate_train.evaluate import set_warnings
+
+# fmt: off
+_PULL: tuple[Row, ...] = (
+    ("host", "as for ssh: user@box", {"metavar": "HOST"}),
+    ("--from", f"on the box ({pull.FOLDER})", text("DIR", pull.FOLDER, dest="folder")),
+    options.folder("here; its folders are those of the box"),
+    ("--port", "of the box's sshd", text("N", type=int)),
+    ("--ssh-option", "as for ssh -o, e.g. User=pi", text("OPTION", action="append", default=[])),
+)
+# fmt: on
 
 
 def register(add: Add) -> None:
     """sets and pull."""
-    _add_sets(add)
-    _add_pull(add)
-
-
-def _add_sets(add: Add) -> None:
-    known = add("sets", run_known)
-    commands = known.add_subparsers(metavar="COMMAND")
-    describe = commands.add_parser(
-        "describe", help="count what is in sets: materials by position and session, frames lost"
-    )
-    describe.add_argument("sets", nargs="+", metavar="SET", help=options.SET)
-    describe.set_defaults(run=run_describe)
-    view = commands.add_parser("view", help="draw sweeps: taxels over time, spectrum, spectrogram")
-    view.add_argument(
-        "sweep", metavar="SWEEP", help=f"an .npy that the box recorded, or a SET: {options.SET}"
-    )
-    view.add_argument(
-        "--number",
-        type=numbers.span("--number", "0-49"),
-        metavar="N[-LAST]",
-        help="which sweep of the set, from 0 on; of a page the first and the last",
-    )
-    view.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
-    )
-    view.set_defaults(run=run_view)
-    robot = commands.add_parser("lerobot", help="write a set as a LeRobot data set, version 3.0")
-    robot.add_argument("set", metavar="SET", help=options.SET)
-    robot.add_argument("out", type=Path, metavar="OUT", help="its folder, which is made")
-    robot.set_defaults(run=run_lerobot)
-    shown = commands.add_parser("mcap", help="write sweeps as MCAP, which Foxglove draws")
-    shown.add_argument("set", metavar="SET", help=f"{options.SET}; of a folder, verdicts too")
-    shown.add_argument("out", type=Path, metavar="OUT", help="the new file, such as mine.mcap")
-    shown.set_defaults(run=run_mcap)
-
-
-def _add_pull(add: Add) -> None:
+    commands = add("sets", run_known).add_subparsers(metavar="COMMAND")
+    for name, about, run, rows in _of_sets():
+        command = commands.add_parser(name, help=about)
+        command.set_defaults(run=run)
+        add_rows(command, *rows)
     command = add("pull", run_pull)
     command.set_defaults(resumes=True)
-    command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
-    command.add_argument(
-        "--from",
-        default=pull.FOLDER,
-        metavar="DIR",
-        dest="folder",
-        help=f"on the box ({pull.FOLDER})",
-    )
-    options.add_folder(command, "here; its folders are those of the box")
-    command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
-    command.add_argument(
-        "--ssh-option",
-        action="append",
-        default=[],
-        metavar="OPTION",
-        help="as for ssh -o, e.g. User=pi",
-    )
+    add_rows(command, *_PULL)
+
+
+def _of_sets() -> Iterator[tuple[str, str, Run, tuple[Row, ...]]]:
+    """The commands below `sets`: name, description, function and options of each."""
+    # fmt: off
+    yield ("describe", "count what is in sets: materials by position and session, frames lost",
+        run_describe, (("sets", options.SET, {"nargs": "+", "metavar": "SET"}),))
+    yield ("view", "draw sweeps: taxels over time, spectrum, spectrogram", run_view, (
+        ("sweep", f"an .npy that the box recorded, or a SET: {options.SET}", {"metavar": "SWEEP"}),
+        ("--number", "which sweep of the set, from 0 on; of a page the first and the last",
+            text("N[-LAST]", type=numbers.span("--number", "0-49"))),
+        ("--out", "FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
+            path(required=True)),
+    ))
+    yield ("lerobot", "write a set as a LeRobot data set, version 3.0", run_lerobot, (
+        ("set", options.SET, {"metavar": "SET"}),
+        ("out", "its folder, which is made", path("OUT")),
+    ))
+    yield ("mcap", "write sweeps as MCAP, which Foxglove draws", run_mcap, (
+        ("set", f"{options.SET}; of a folder, verdicts too", {"metavar": "SET"}),
+        ("out", "the new file, such as mine.mcap", path("OUT")),
+    ))
+    # fmt: on
 
 
 def run_known(args: argparse.Namespace) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.bundle import bundle
+from palpate.core.outputs import add_rows
 from palpate.core.text import say
 from palpate_train.arguments import numbers
 from palpate_train.export import sign
@@ -18,21 +19,15 @@ if TYPE_CHECKING:
 
 def register(add: Add) -> None:
     """sign."""
-    command = add("sign", run)
-    command.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
-    command.add_argument(
-        "--key",
-        type=Path,
-        metavar="KEY",
-        help="your private key (default: the key that `make install` has made, "
-        "~/.config/palpate/signing-key)",
+    # fmt: off
+    add_rows(add("sign", run),
+        ("bundle", "its folder", {"type": Path, "metavar": "BUNDLE"}),
+        ("--key", "your private key (default: the key that `make install` has made,"
+            " ~/.config/palpate/signing-key)", {"type": Path, "metavar": "KEY"}),
+        ("--counter", "above that of every bundle delivered before (1 for the first)",
+            {"type": numbers.whole("--counter", 1), "metavar": "N"}),
     )
-    command.add_argument(
-        "--counter",
-        type=numbers.whole("--counter", 1),
-        metavar="N",
-        help="above that of every bundle delivered before (1 for the first)",
-    )
+    # fmt: on
 
 
 def run(args: argparse.Namespace) -> None:

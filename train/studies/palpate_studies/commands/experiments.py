@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
+from palpate.core.outputs import Row, add_rows
 from palpate_studies import (
     development_experiment,
     development_times,
@@ -19,51 +21,35 @@ from palpate_studies import (
 from palpate_studies.pages import PAGES
 from palpate_studies.study import StudyRun, add_out, read, save
 from palpate_train.arguments import options
+from palpate_train.arguments.options import EFFORT, FLAG, WHERE, path, text
 from palpate_train.arguments.program import Add
+
+# fmt: off
+_DATA: Row = ("--data", "folder of real sweeps (PALPATE_DATA)",
+    path("DIR", default=os.environ.get("PALPATE_DATA")))
+_METHOD = "NAME[,NAME...]"
+_OPTIONS: Mapping[str, tuple[Row, ...]] = {
+    "paper": (),
+    "development": (
+        ("--seeds", "of training: 1 to N (1)", text("N", 1, type=int)),
+        ("--method", "(ours, as fit trains it, and the peers)", text(_METHOD)),
+        ("--times", "measure the times of the results in --out again, and keep their accuracies",
+            FLAG),
+    ),
+    "fabrics": (("--method", "(all)", text(_METHOD, "all")),),
+    "recipe": (),
+}
+# fmt: on
 
 
 def register(add: Add) -> None:
     """Add all commands of this module."""
-    development = add("development", run_development)
-    _add_development(development)
-    fabrics = add("fabrics", run_fabrics)
-    fabrics.add_argument("--method", default="all", metavar="NAME[,NAME...]", help="(all)")
-    for name, command in (
-        ("paper", add("paper", run_paper)),
-        ("development", development),
-        ("fabrics", fabrics),
-        ("recipe", add("recipe", run_recipe)),
-    ):
-        _add_run(command, name)
-
-
-def _add_run(command: argparse.ArgumentParser, name: str) -> None:
-    """Options of every study."""
-    add_out(command, name)
-    if name != "paper":
-        command.add_argument(
-            "--data",
-            type=Path,
-            default=os.environ.get("PALPATE_DATA"),
-            metavar="DIR",
-            help="folder of real sweeps (PALPATE_DATA)",
-        )
-    options.add_effort(command)
-    options.add_where(command)
-
-
-def _add_development(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)"
-    )
-    command.add_argument(
-        "--method", metavar="NAME[,NAME...]", help="(ours, as fit trains it, and the peers)"
-    )
-    command.add_argument(
-        "--times",
-        action="store_true",
-        help="measure the times of the results in --out again, and keep their accuracies",
-    )
+    runs = (run_paper, run_development, run_fabrics, run_recipe)
+    for (name, rows), run in zip(_OPTIONS.items(), runs, strict=True):
+        command = add(name, run)
+        add_rows(command, *rows)
+        add_out(command, name)
+        add_rows(command, *[_DATA] * (name != "paper"), EFFORT, *WHERE)
 
 
 def _run(args: argparse.Namespace) -> StudyRun:

@@ -13,6 +13,7 @@ import numpy as np
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
+from palpate.core.outputs import Row, add_rows
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_studies import (
@@ -25,6 +26,7 @@ from palpate_studies import (
 )
 from palpate_studies.study import add_out, save
 from palpate_train.arguments import options
+from palpate_train.arguments.options import EFFORT, WHERE, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
 from palpate_train.data.corruptions import applicable
@@ -53,10 +55,25 @@ STRESSED_METHODS = (
 """First the recipe of the packaged bundle."""
 
 
+# fmt: off
+_STRESS: tuple[Row, ...] = (
+    ("--split", "train on this share of the set's groups, as `fit --split` with seed 1, and corrupt"
+        f" the rest instead of {STRESSED}, which is drawn anew", text("GROUP:SHARE")),
+    ("--method", "ours first; the first five are drawn; or all; see palpate-train evaluate --list"
+        f" ({STRESSED_METHODS})", text("NAME[,NAME...]", STRESSED_METHODS)),
+    ("--seeds", "of training and corruptions: 1 to N (1)", text("N", 1, type=int)),
+)
+# fmt: on
+
+
 def register(add: Add) -> None:
     """Add all commands of this module."""
-    _add_stress(add)
-    _add_certainty(add)
+    stressed = add("stress", run_stress)
+    options.add_set(stressed, "sim:T-REAL/level-blind:1")
+    add_rows(stressed, *_STRESS)
+    for command, name in ((stressed, "stress"), (add("certainty", run_certainty), "certainty")):
+        add_out(command, name)
+        add_rows(command, EFFORT, *WHERE)
     add_out(add("alignment", run_alignment), "alignment", kept=False)
     add_out(add("rules", run_rules), "rules", kept=False)
 
@@ -67,37 +84,6 @@ def run_rules(args: argparse.Namespace) -> None:
     result = rules_study.results(packaged, tested, moved, EACH, options.Log())
     save(args.out, result)
     print(rules_table.table(result))
-
-
-def _add_stress(add: Add) -> None:
-    command = add("stress", run_stress)
-    options.add_set(command, "sim:T-REAL/level-blind:1")
-    command.add_argument(
-        "--split",
-        metavar="GROUP:SHARE",
-        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
-        f"the rest instead of {STRESSED}, which is drawn anew",
-    )
-    command.add_argument(
-        "--method",
-        default=STRESSED_METHODS,
-        metavar="NAME[,NAME...]",
-        help="ours first; the first five are drawn; or all; "
-        f"see palpate-train evaluate --list ({STRESSED_METHODS})",
-    )
-    command.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
-    )
-    add_out(command, "stress")
-    options.add_effort(command)
-    options.add_where(command)
-
-
-def _add_certainty(add: Add) -> None:
-    command = add("certainty", run_certainty)
-    add_out(command, "certainty")
-    options.add_effort(command)
-    options.add_where(command)
 
 
 def run_stress(args: argparse.Namespace) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
 from palpate_studies import overview_plot, pages, reports, tables
 from palpate_studies.study import DATA
 from palpate_train.arguments import options
+from palpate_train.arguments.options import FLAG, WHERE
 from palpate_train.arguments.program import Add
 from palpate_train.metrics import score
 from palpate_train.reports import provenance
@@ -16,28 +18,24 @@ from palpate_train.reports import provenance
 OVERVIEW = Path("docs/overview.svg")
 
 
+# fmt: off
+_REPORTS: tuple[Row, ...] = (
+    ("names", f"some of {', '.join(reports.names())}", {"nargs": "*", "metavar": "NAME"}),
+    ("--list", "run nothing: say which results are stale, and why", FLAG),
+    *WHERE,
+)
+_PAGES: tuple[Row, ...] = (
+    ("names", f"some of {', '.join(pages.PAGES)} (all)", {"nargs": "*", "metavar": "NAME"}),
+    options.folder("a folder for each page is made there"),
+    ("--results", f"folder of the files of results ({DATA})", options.path("DIR", default=DATA)),
+)
+# fmt: on
+
+
 def register(add: Add) -> None:
     """Add all commands of this module."""
-    command = add("reports", run_reports)
-    command.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"some of {', '.join(reports.names())}"
-    )
-    command.add_argument(
-        "--list", action="store_true", help="run nothing: say which results are stale, and why"
-    )
-    options.add_where(command)
-    command = add("pages", run_pages)
-    command.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"some of {', '.join(pages.PAGES)} (all)"
-    )
-    options.add_folder(command, "a folder for each page is made there")
-    command.add_argument(
-        "--results",
-        type=Path,
-        default=DATA,
-        metavar="DIR",
-        help=f"folder of the files of results ({DATA})",
-    )
+    add_rows(add("reports", run_reports), *_REPORTS)
+    add_rows(add("pages", run_pages), *_PAGES)
     add("tables", run_tables)
     add("overview", run_overview)
 
