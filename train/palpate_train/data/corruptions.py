@@ -83,28 +83,20 @@ def _scene(test: EvaluationSweeps) -> SimulatedScene:
     return test.scene
 
 
-def _shift(x: Array, rows: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _scene(test).draw(lambda p: replace(p, dx_mm=p.dx_mm + rows * skin.PITCH_MM))
-
-
-def _turn(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _scene(test).draw(lambda p: replace(p, turn_deg=p.turn_deg + degrees))
-
-
 def _force(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
     scene = _scene(test)
-    return scene.draw(
-        world=replace(scene.physics, force_n=scene.physics.force_n * (1 + sign * share))
-    )
+    force_n = scene.physics.force_n * (1 + sign * share)
+    return scene.draw(world=replace(scene.physics, force_n=force_n))
+
+
+def _speed(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
+    scene = _scene(test)
+    return scene.draw(world=replace(scene.physics, speed=1 + sign * share))
 
 
 def _error_ms(x: Array, ms: float, rng: Generator) -> Array:
     late_ms: Array = ms * rng.choice([-1, 1], len(x))
     return late_ms
-
-
-def _window(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _scene(test).draw(late_ms=_error_ms(x, ms, rng))
 
 
 def _window_held(x: Array, ms: float, rng: Generator, test: EvaluationSweeps) -> Array:
@@ -149,14 +141,6 @@ def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator)
     return read
 
 
-def _shift_grid(x: Array, rows: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _regrid(x, rows, 0.0, rows / ROWS[1][-1], rng)
-
-
-def _turn_grid(x: Array, degrees: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return _regrid(x, 0.0, degrees, degrees / DEGREES[1][-1], rng)
-
-
 def _some(x: Array, n: float, rng: Generator) -> Array:
     """`n` random taxels of each sweep, or all if there are fewer: bool [N, 1, R, C] or [N, 1, R, C,
     1]."""
@@ -191,19 +175,6 @@ TAXEL_FAULTS: dict[str, TaxelFault] = {"dead": dead, "stuck": stuck, "noisy": no
 
 def _random(fault: TaxelFault, x: Array, n: float, rng: Generator, test: EvaluationSweeps) -> Array:
     return fault(x, _some(x, n, rng), rng, test)
-
-
-def _gain_spread(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return x * (1 + share * rng.uniform(-1, 1, (len(x), 1, *x.shape[2:])))
-
-
-def _gain(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    return x * (1 + sign * share)
-
-
-def _speed(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    scene = _scene(test)
-    return scene.draw(world=replace(scene.physics, speed=1 + sign * share))
 
 
 def _stretch(sign: int, x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
@@ -242,11 +213,6 @@ def _lost(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Arr
     return x
 
 
-def _saturation(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Array:
-    top = (1 - share) * test.load
-    return np.clip(x, -top, top)
-
-
 def _hum(x: Array, ratio: float, rng: Generator, test: EvaluationSweeps) -> Array:
     turns = HUM_HZ * np.arange(x.shape[1]) / test.sweeps.rate_hz + rng.random((len(x), 1))
     return x + ratio * test.rms * np.sin(2 * np.pi * _over(turns, x))
@@ -273,45 +239,39 @@ HUM: Axis = "deviations", (0, 0.25, 0.5, 1, 2)
 NOISE: Axis = "deviations", (0, 0.1, 0.2, 0.3, 0.5)
 EDGE, LATE = "edge mirrored, new gains", "window too early or late"
 Row = tuple[str, str, Axis, str, Change]
+# fmt: off
 _DRAWN: Sequence[Row] = (
-    ("shift-rows", "skin further along", ROWS, "skin further along the sliding", _shift),
-    ("turn", "skin turned", DEGREES, "skin turned on the finger", _turn),
+    ("shift-rows", "skin further along", ROWS, "skin further along the sliding",
+        lambda x, rows, rng, test: _scene(test).draw(
+            lambda p: replace(p, dx_mm=p.dx_mm + rows * skin.PITCH_MM))),
+    ("turn", "skin turned", DEGREES, "skin turned on the finger",
+        lambda x, degrees, rng, test: _scene(test).draw(
+            lambda p: replace(p, turn_deg=p.turn_deg + degrees))),
     ("force-down", "less force", SHARE, "pressed less", partial(_force, -1)),
     ("force-up", "more force", SHARE, "pressed more", partial(_force, 1)),
     ("speed-down", "slower", SHARE, "slid slower", partial(_speed, -1)),
     ("speed-up", "faster", SHARE, "slid faster", partial(_speed, 1)),
-    ("window", "window off", MS, f"{LATE}, into the rest", _window),
+    ("window", "window off", MS, f"{LATE}, into the rest",
+        lambda x, ms, rng, test: _scene(test).draw(late_ms=_error_ms(x, ms, rng))),
 )
 _PLACED: Sequence[Row] = (
-    ("shift-grid", "skin further along", ROWS, f"taxels read further on, {EDGE}", _shift_grid),
-    ("turn-grid", "skin turned", DEGREES, f"taxels read on a turned grid, {EDGE}", _turn_grid),
+    ("shift-grid", "skin further along", ROWS, f"taxels read further on, {EDGE}",
+        lambda x, rows, rng, test: _regrid(x, rows, 0.0, rows / ROWS[1][-1], rng)),
+    ("turn-grid", "skin turned", DEGREES, f"taxels read on a turned grid, {EDGE}",
+        lambda x, degrees, rng, test: _regrid(x, 0.0, degrees, degrees / DEGREES[1][-1], rng)),
     ("window-held", "window off", MS, f"{LATE}, first or last frame held", _window_held),
 )
 _TAXELS: Sequence[Row] = (
     ("dead", "dead taxels", TAXELS, "read 0", partial(_random, dead)),
-    (
-        "stuck",
-        "stuck taxels",
-        TAXELS,
-        "each at some count of the set's range",
-        partial(_random, stuck),
-    ),
-    (
-        "noisy",
-        "noisy taxels",
-        TAXELS,
-        f"white noise of {NOISY:g} of the set's deviations",
-        partial(_random, noisy),
-    ),
-    (
-        "gain-spread",
-        "uneven gains",
-        SHARE,
-        "each taxel's gain off by up to this share",
-        _gain_spread,
-    ),
-    ("gain-down", "lower gain", SHARE, "all gains lower", partial(_gain, -1)),
-    ("gain-up", "higher gain", SHARE, "all gains higher", partial(_gain, 1)),
+    ("stuck", "stuck taxels", TAXELS, "each at some count of the set's range",
+        partial(_random, stuck)),
+    ("noisy", "noisy taxels", TAXELS, f"white noise of {NOISY:g} of the set's deviations",
+        partial(_random, noisy)),
+    ("gain-spread", "uneven gains", SHARE, "each taxel's gain off by up to this share",
+        lambda x, share, rng, test: x * (
+            1 + share * rng.uniform(-1, 1, (len(x), 1, *x.shape[2:])))),
+    ("gain-down", "lower gain", SHARE, "all gains lower", lambda x, share, *_: x * (1 - share)),
+    ("gain-up", "higher gain", SHARE, "all gains higher", lambda x, share, *_: x * (1 + share)),
 )
 _TIMED: Sequence[Row] = (
     ("stretch", "slower", SHARE, "slower: all is stretched in time", partial(_stretch, -1)),
@@ -320,17 +280,14 @@ _TIMED: Sequence[Row] = (
 _SIGNAL: Sequence[Row] = (
     ("drift", "drift", DRIFT, "offset of each taxel, from one to another", _drift),
     ("bits", "fewer bits", BITS, "steps of the set's range: 7, 6, 5, 4 bits", _bits),
-    (
-        "lost",
-        "lost frames",
-        LOST,
-        "frames lost, at most two in a row, filled as the box does",
-        _lost,
-    ),
-    ("saturation", "saturation", SHARE, "clipped so far below full load", _saturation),
+    ("lost", "lost frames", LOST, "frames lost, at most two in a row, filled as the box does",
+        _lost),
+    ("saturation", "saturation", SHARE, "clipped so far below full load",
+        lambda x, share, rng, test: np.clip(x, -(top := (1 - share) * test.load), top)),
     ("hum", "50 Hz hum", HUM, "50 Hz on all taxels, amplitude", _hum),
     ("noise", "white noise", NOISE, "white, of each taxel's deviation", _noise),
 )
+# fmt: on
 
 
 def _corruption(row: Row, only: str = "", more: str = "") -> Corruption:
