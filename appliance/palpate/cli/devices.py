@@ -47,10 +47,10 @@ def simulated(
     *,
     remember: bool = True,
     spread: bool = False,
-    touring: bool = False,
+    demo: bool = False,
 ) -> RobotDevices:
-    """A simulated robot with a readout board on USB. touring: it plays the tour of the demo."""
-    from palpate.sim import devices, rig, script, tour
+    """A simulated robot with a readout board on USB. demo: it plays the sweeps of the demo."""
+    from palpate.sim import demo_script, devices, rig, script
 
     clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
@@ -61,5 +61,5 @@ def simulated(
             " out, or connect this skin"
         )
     acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
-    acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
+    acts = islice(demo_script.acts(format, args.seed) if demo else acts, args.sweeps)
     return devices.build(format, acts, clock, source, remember=remember, follows=follows)

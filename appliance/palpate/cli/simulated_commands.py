@@ -19,8 +19,8 @@ from palpate.io import skins
 from palpate.io.robot_link import SerialSink
 from palpate.runtime import assembly
 
-TOUR = 8
-"""Sweeps of the tour."""
+SCRIPTED = 8
+"""Sweeps of the script of the demo."""
 NEXT = """\
 next: palpate demo --raw     the sentences that the robot reads
       make desktop           then docs/tutorials/first-model.md: your first model in 15 minutes"""
@@ -37,17 +37,17 @@ def _played_bundle(settings: Config) -> Bundle:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Show a tour of good and faulty sweeps, or the sweeps of --sim, from both ends of a line."""
+    """Show good and faulty sweeps in turn, or the sweeps of --sim, from both ends of a line."""
     from palpate.tools import demo, pseudo_terminal
 
     settings = load_settings(args)
     # the simulated robot drives GPIO lines
     settings = replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
     bundle = _played_bundle(settings)
-    touring = not args.sim and skins.profile(settings).codec == "palpate"
-    args.sweeps = args.sweeps or (TOUR if touring else 12)
+    scripted = not args.sim and skins.profile(settings).codec == "palpate"
+    args.sweeps = args.sweeps or (SCRIPTED if scripted else 12)
     name = args.sim or "skin"
-    devices = simulated(name, bundle.format, args, settings, spread=True, touring=touring)
+    devices = simulated(name, bundle.format, args, settings, spread=True, demo=scripted)
     stopped = StopFlag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())

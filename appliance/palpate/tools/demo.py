@@ -136,7 +136,7 @@ class Demo:
             self._print("", *self._ending(box))
 
     def _ending(self, box: Box) -> list[str]:
-        """The sum of the answers: a table by material, or a sentence after a tour."""
+        """The sum of the answers: a table by material, or a sentence after the script."""
         counters = box.counters
         sent = counters.frames + counters.lost_frames
         lines = [

@@ -29,11 +29,11 @@ def simulated(
     *,
     remember: bool = True,
     spread: bool = False,
-    touring: bool = False,
+    demo: bool = False,
 ) -> RobotDevices:
     """A robot with the emulated skin of the settings on a terminal."""
     if skins.profile(settings).codec == "palpate":
-        more = {"remember": remember, "spread": spread, "touring": touring}
+        more = {"remember": remember, "spread": spread, "demo": demo}
         return BY_BOARD(name, format, args, settings, **more)
     clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     profile, follows = skins.profile(settings), settings.trigger.mode == "serial"

@@ -43,7 +43,7 @@ def test_demo_prints_plain_lines_or_sentences_alone(capsys):
 def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys):
     """A stuck taxel is bridged; an untaught material is unknown; a sweep over two materials is
     unknown; a pulled cable is sensor-lost, and the next sweep is named again. If a new default
-    bundle is sure about two materials, tour.SEED has to be drawn again."""
+    bundle is sure about two materials, demo_script.SEED has to be drawn again."""
     assert main(["demo", "--virtual"]) == 0
     out = capsys.readouterr().out
     rows = [line for line in out.splitlines() if "-> " in line]

@@ -28,14 +28,14 @@ UNPLUGGED = 0.4, 0.7
 """When the skin is unplugged and plugged in again, as a share of a sweep."""
 
 
-def tour(format: SweepFormat, seed: int) -> Iterator[Act]:
-    """The tour, then tubes without end. format: of the simulated skin, see script.named."""
+def acts(format: SweepFormat, seed: int) -> Iterator[Act]:
+    """The sweeps of the demo, then tubes without end. format: as for script.named."""
     world = replace(script.PLAYED, shear=format == skin.SHEAR_FORMAT)
     return chain(_special(np.random.default_rng(SEED), world), script.tubes(seed, world=world))
 
 
 def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
-    """The sweeps of the tour, drawn one after another."""
+    """The sweeps of the demo, drawn one after another."""
     place = skin.placements("T-LAB", PLACES)[0]
 
     def over(tube: str) -> Act:
