@@ -257,7 +257,7 @@ class ModbusBridge:
             return
         if self._commanding.locked():
             raise RequestRefused(ExceptionCode.BUSY)
-        async with self._commanding:  # no other peer's command comes between those of one write
+        async with self._commanding:  # no other peer commands within one write
             for name in sorted(rising, key=ORDER.index):
                 await self._command(name, slide if name == "START" else ())
                 coils[rising[name]] = True  # only now: a refused command is sent again

@@ -42,7 +42,7 @@ from palpate.core.retry import retried
 KEPT = 1000
 """Verdicts that wait for the broker; then the oldest is dropped and counted."""
 HEADER, LARGEST = 16, 268_435_455
-"""Most bytes of a message beside topic and content, and of one for which a broker sets no limit."""
+"""Most bytes of a message around topic and content, and of one for which a broker sets no limit."""
 FLYING = 16
 """Messages that the broker has not acknowledged, at most; the others wait here, in order. paho
 would let more wait without a bound, verdicts behind all else. Brokers may allow fewer."""

@@ -34,7 +34,7 @@ class BoundedClient(paho.Client):
 
 @dataclass(frozen=True, slots=True)
 class Broker:
-    """Where the broker is. ca: file with the certificates to trust, "" for those of the system.
+    """Where the broker is. ca: file with the certificates to trust, "" for the system's.
     user: "" for none."""
 
     host: str

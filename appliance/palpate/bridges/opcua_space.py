@@ -1,4 +1,4 @@
-"""The address space of the OPC UA server: of the standard's nodes those that a box needs.
+"""The address space of the OPC UA server: the standard's nodes that a box needs.
 
 The library would build all 6,200, with types for alarms, roles, PubSub and others. Here are those
 with low numbers, which the first edition of the standard had, and the limits of a request. That

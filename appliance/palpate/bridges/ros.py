@@ -1,5 +1,5 @@
 """The box as a ROS 2 node with a lifecycle, over its serial line or its feed. Publishes verdicts,
-state, frames and diagnostics in standard messages and in those of ros_optional.py, and offers
+state, frames and diagnostics in standard messages and the messages of ros_optional.py, and offers
 services and the action of palpate_msgs (docs/robots/ros2.md)."""
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Serve until SIGINT or SIGTERM. arguments: those of ROS."""
+    """Serve until SIGINT or SIGTERM. arguments: of ROS."""
     rclpy.init(args=["palpate", "--ros-args", *arguments] if arguments else ["palpate"])
     node = PalpateNode()
     # news; a command; a sweep; goals and cancelling meanwhile

@@ -132,7 +132,7 @@ class LineSource:
 
 
 class FeedSource:
-    """The box over its feed, on the box itself: read-only, beside a robot that has the serial line.
+    """The box over its feed, on the box itself: read-only next to a robot that has the serial line.
 
     frame: is called with each frame line of the feed, `frames_hz` times a second.
     """

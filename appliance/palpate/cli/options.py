@@ -13,7 +13,7 @@ from palpate.core.outputs import Row
 
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of the pages of `palpate watch`; and of `palpate record` or `palpate teach`, which
-run beside it."""
+run next to it."""
 NO_SETTINGS: Mapping[str, Any] = {"board": None, "set": [], "config_dir": None, "unit": ""}
 """The options of `add_settings` where none is given."""
 

@@ -74,7 +74,7 @@ def _classify(
         for one in filter(None, (trial, release)):
             one.disk = disk
         sent_back = releases.text()
-        # not beside a trial: if the program dies, it must be clear which bundle was the cause
+        # not next to a trial: if the program dies, it must be clear which bundle was the cause
         shadow = None if trial else _shadow(args, settings, current, devices, disk)
         facts = {
             "trial": lambda: trial.text if trial else "",
@@ -154,7 +154,7 @@ def _shadow(
     devices: Devices,
     disk: DiskThread,
 ) -> Shadow | None:
-    """The candidate of `--shadow`, which classifies beside the current bundle. None without a
+    """The candidate of `--shadow`, which classifies next to the current bundle. None without a
     candidate, and for a candidate that cannot run."""
     try:
         candidate = None

@@ -57,7 +57,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def _check_bytes(settings: Config, profile: SkinProfile, devices: Devices, seconds: float) -> int:
-    """Print the first frames of a skin with a profile beside their bytes; 1 if a byte misfits."""
+    """Print the first frames of a skin with a profile next to their bytes; 1 if a byte misfits."""
     from palpate.io.serial_link import find
     from palpate.tools import skin_bytes, skin_detect
 

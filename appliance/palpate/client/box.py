@@ -292,7 +292,7 @@ class Palpate:
             self._listener(news)
 
     def _whole(self, answer: Answer) -> Answer:
-        """The answer with those of its fingers, which came before it."""
+        """The answer with the answers of its fingers, which came before it."""
         fingers = tuple(f for f in self._fingers if f.sweep == answer.sweep)
         self._fingers.clear()
         return replace(answer, fingers=fingers)

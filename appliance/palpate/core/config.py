@@ -327,9 +327,9 @@ def load(
 
     board: NAME of a `board-NAME.toml`. None or "" takes `board = "NAME"` in `site`; without it no
     GPIO line is wired. sets: "section.key=value", the value in TOML or a bare string. folder: where
-    `skin.toml` and the boards' files are; None means `firmware_config/` beside the package, in an
+    `skin.toml` and the boards' files are; None means `firmware_config/` next to the package, in an
     installation `/etc/palpate`. site: must exist unless it is SITE. unit: name of one of several
-    units; its settings are NAME.toml beside SITE, its default folders have its name. Raises
+    units; its settings are NAME.toml next to SITE, its default folders have its name. Raises
     ConfigError with file, key, value and the allowed values.
     """
     if unit:

@@ -1,4 +1,4 @@
-"""Work on the disk beside the loop. A sync of a bad card takes seconds, in which frames would be
+"""Work on the disk next to the loop. A sync of a bad card takes seconds, in which frames would be
 lost.
 
 `DiskThread` does the work in one thread, in order, from a bounded queue. Its results are given back

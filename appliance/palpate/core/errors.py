@@ -1,7 +1,7 @@
 """The error tree of the box: each class is one kind of error, with the exit code of the command
 line.
 
-Messages are lower case, name the wrong value and the remedy. Exit codes are those of sysexits.h.
+Messages are lower case, name the wrong value and the remedy. Exit codes are from sysexits.h.
 """
 
 import errno

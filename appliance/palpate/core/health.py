@@ -10,7 +10,7 @@ class Health(NamedTuple):
 
     time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: the reason why the skin does
     not stream, "" if it does. streams: frames are arriving. ready: a sweep can be taken now, as the
-    GPIO line READY shows. The counts, since the program started, are those of the STA sentence: of
+    GPIO line READY shows. The counts since the program started are as in the STA sentence: of
     the sensor from `frames` to `enumerations` and from `stale_frames` to `fifo_overflows` (see
     SensorCounters), of the serial line `dropped`, of the trigger `glitches`, `lost_edges` and
     `storms` (see EdgeCounters). loss_known: the skin counts its frames; if not, `lost_frames`

@@ -1,6 +1,6 @@
 """The log of the box, one line for each event, on standard error for a terminal or the journal.
 
-The levels are those of `logging`. systemd's journal gets them as priorities, so `journalctl -p
+The levels are as in `logging`. systemd's journal gets them as priorities, so `journalctl -p
 warning` shows only warnings. If the log cannot be written its lines are lost, but classifying goes
 on.
 """

@@ -63,7 +63,7 @@ def composed(text: str) -> str:
 
 
 class TypedNames:
-    """Names of materials as a person types them, in any language. displays: those that differ from
+    """Names of materials as a person types them, in any language. displays: names that differ from
     their labels, by label. plain: labels of other materials, which have no such name."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Options of command lines: from a table, and types of those that name a new folder or file. An
+"""Options of command lines: from a table, and types of options for a new folder or file. An
 ending that belongs to something else is refused while the command line is read, before any work."""
 
 from __future__ import annotations

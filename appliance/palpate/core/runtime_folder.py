@@ -1,4 +1,4 @@
-"""The folder of a running box, and the names in it, for the box and for programs beside it.
+"""The folder of a running box, and the names in it, for the box and for programs next to it.
 `palpate status` finds its file by this module alone: scripts call it often."""
 
 import os

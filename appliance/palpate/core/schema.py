@@ -42,7 +42,7 @@ Positive = Annotated[float, Within(LEAST, MOST)]
 
 
 def fixed(value: _Kind) -> _Kind:
-    """A field that files cannot set: a constant beside the settings it belongs to."""
+    """A field that files cannot set: a constant next to the settings it belongs to."""
     return field(default=value, metadata={"fixed": True})
 
 

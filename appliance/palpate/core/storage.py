@@ -94,7 +94,7 @@ def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | No
 
 @contextmanager
 def folder(target: Path) -> Iterator[Path]:
-    """A new folder beside `target`. If the block ends without an exception, its files are synced
+    """A new folder next to `target`. If the block ends without an exception, its files are synced
     and it takes the name `target` in one step, replacing an earlier folder; otherwise it is
     removed. Raises OSError, with the name of the folder if a write fails."""
     import tempfile  # costs 1 MB of memory with its imports, needed only to write a bundle

@@ -1,4 +1,4 @@
-"""Recorded sweeps as files: an .npy with one record per frame, and a JSON sidecar beside it."""
+"""Recorded sweeps as files: an .npy with one record per frame, and a JSON sidecar next to it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from palpate.core.types import Frames, Status, Sweep, SweepFormat
 SCHEMA = 1
 """Version of a recorded sweep's sidecar."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
-"""Errors of numpy for a broken .npy, beside OSError."""
+"""Errors of numpy for a broken .npy, next to OSError."""
 
 
 def _record_dtype(format: SweepFormat) -> np.dtype[Any]:
@@ -31,7 +31,7 @@ def _record_dtype(format: SweepFormat) -> np.dtype[Any]:
 def save(
     path: Path, sweep: Sweep, format: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
-    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it,
+    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar next to it,
     completely or not at all.
 
     The sidecar gets its name first, so that an .npy always has one. A field that is None is left

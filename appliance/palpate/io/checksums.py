@@ -118,7 +118,7 @@ def parsed(text: str) -> Checksum | None:
     if made is None:
         return None
     if words and kind.startswith("crc"):
-        made = Checksum(kind)  # nothing of the named check remains beside given parameters
+        made = Checksum(kind)  # nothing of the named check remains next to given parameters
     for word in words:
         match = _PARAMETERS.fullmatch(word)
         if word == "reflected":

@@ -56,7 +56,7 @@ class Sensor(Protocol):
 
     @property
     def loss_known(self) -> bool:
-        """Whether every lost frame is seen, not only those that times show."""
+        """Whether every lost frame is seen, not only losses that times show."""
         ...
 
     @property

@@ -340,7 +340,7 @@ class Box:
         return [f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), *counts, *_last_fields(h)]
 
     def _obey_asked(self) -> None:
-        """Carry out the commands, and answer those that are done: also those of earlier turns."""
+        """Carry out the commands, and answer all that are done, also of earlier turns."""
         self._say_owed()
         while self._port and self._asked:
             command = self._asked.popleft()

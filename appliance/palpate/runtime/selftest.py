@@ -117,7 +117,7 @@ def _try(component: str, look: Callable[[], str]) -> CheckResult:
 
 
 def _speed(manifest: Manifest) -> str:
-    """The speeds that can be measured, and those of training."""
+    """The speeds that can be measured, and the speeds of training."""
     place, trained = manifest.contact, manifest.speeds
     meter = SlideMeter(manifest.format, place.pitch_mm if place else None)
     if meter.why is not None:

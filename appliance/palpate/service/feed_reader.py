@@ -24,7 +24,7 @@ QUEUE_BYTES = 768 * 1024
 """Most bytes that wait for one reader: a window of 640 kB as text, and other lines. Readers that
 stand still hold the same lines."""
 LINE_BYTES = 200
-"""What a line counts beside its bytes: some 60 for the object, and a place in each queue. Without
+"""What a line counts next to its bytes: some 60 for the object, and a place in each queue. Without
 it frames of minutes would wait, whose places in twenty queues take more than the frames."""
 HEARD_BYTES = 64
 """Bytes of requests that are read at once."""

@@ -1,4 +1,4 @@
-"""Why the service has ended: a small file beside the status file, for `palpate status`, and for the
+"""Why the service has ended: a small file next to the status file, for `palpate status` and for the
 pause before the next start.
 
 The file is in memory (/run), so it does not outlive a boot.
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 AGAIN_NS = 60_000_000_000
 """A failure within this time after the last one lengthens the pause."""
 PAUSES_S = (0.0, 1.0, 2.0, 4.0, 6.0)
-"""Pauses after the first failure, the second and so on, beside RestartSec of the unit. The last is
+"""Pauses after the first failure, the second and so on, next to RestartSec of the unit. The last is
 shorter than TimeoutStopSec."""
 MOST_BYTES = 1 << 14
 

@@ -196,7 +196,7 @@ class RecordingSession(Observer):
     def _beside(
         self, work: Callable[[], None], done: Callable[[], list[object]], what: str, advice: str
     ) -> Reply:
-        """Do work on the disk beside the loop, which a sync would halt for seconds, and then `done`
+        """Do work on the disk next to the loop, which a sync would halt for seconds, then `done`
         for the reply: what the box has answered must survive a loss of power. Raises
         ApplianceError if it fails at once."""
         reply: Future[list[object]] = Future()

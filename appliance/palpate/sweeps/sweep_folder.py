@@ -2,7 +2,7 @@
 
 A sweep is sweep-NNNNNN.npy with a sidecar .json. It is learnt from unless it has a reason not to
 be: it is damaged, faulty, early, without a material, or forgotten. The file `forgotten` keeps what
-a person has forgotten, beside the sweeps themselves.
+a person has forgotten, next to the sweeps themselves.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ PERIOD_NS = 1_000_000_000
 """Time between two states of the recording without changes."""
 LABELS = tuple(name.upper() for name in Labels.__slots__)
 TEACHING, MATERIALS = ("TEACH", "USE", "FORGET", "DONE"), ("TEACH", "FORGET")
-"""Commands of a page that teaches, and those of them with the name of a material."""
+"""Commands of a page that teaches, and the commands with the name of a material."""
 TRIGGERS = {
     "two-lines": "the robot's lines START and STOP",
     "one-line": "the robot's line START",

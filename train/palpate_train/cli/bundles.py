@@ -128,7 +128,7 @@ def run_score(args: argparse.Namespace) -> None:
 
 
 def _seen(manifest: Manifest, sweeps: sets.Dataset) -> dict[str, int] | None:
-    """The number of `sweeps` that the bundle was fitted to, of those that could be compared; None
+    """The number of `sweeps` that the bundle was fitted to, of all that could be compared; None
     for a bundle without digests."""
     kept = manifest.made.get("sweeps")
     if not isinstance(kept, str):

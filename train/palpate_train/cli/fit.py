@@ -272,7 +272,7 @@ def _worst(made: Fit) -> Iterator[str]:
 
 
 def _print_held_out(made: Fit) -> None:
-    """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
+    """Print the accuracy on the sweeps that judged the fit, and how they differ from the sweeps of
     --rest."""
     if made.about["held_out_by"] == "nothing":
         say(

@@ -77,7 +77,7 @@ class Augmentation:
     """Largest amplitude of a sine of any frequency, the same on all taxels."""
 
     def without_faults(self) -> Augmentation:
-        """The effects of another position of the skin alone, without those of its electronics.
+        """The effects of another position of the skin alone, without effects of its electronics.
 
         Noise and silent taxels make copies so much harder to name than any displaced skin is that
         an error rate of such copies says nothing about it.

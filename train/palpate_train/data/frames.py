@@ -429,7 +429,7 @@ def _named(name: str, names: Sequence[str], option: str) -> int:
 
 
 def _is_fact(table: Table, name: str) -> bool:
-    """Whether --field means a fact or texts beside the frames. A column of the name comes first."""
+    """Whether --field means a fact or texts next to the frames. A column of the name is first."""
     known = {*table.facts, *table.labels}
     return normal(name) in known and normal(name) not in table.columns
 

@@ -32,7 +32,7 @@ from palpate_train.data.sets import Dataset
 
 Array = NDArray[Any]
 DISPLAY = "display name"
-"""Field of a recording whose material has a display name beside the name that is sent."""
+"""Field of a recording whose material has a display name next to the name that is sent."""
 BATCH = 4096
 """Number of frames that are converted at a time."""
 Fields = dict[str, str]
@@ -294,7 +294,7 @@ def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> lis
 def _without_copies(
     cuts: Sequence[Cut], left_out: list[LeftOutFile]
 ) -> tuple[list[Cut], list[str]]:
-    """The windows without those of recordings that repeat the frames of another of their material.
+    """The windows without recordings that repeat the frames of another of their material.
 
     A copy under another material stays, with a remark: only the user knows which name is wrong.
     """

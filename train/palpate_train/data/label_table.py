@@ -1,4 +1,4 @@
-"""Reads the labels of recordings from a table beside them: a row for each file, the file in the
+"""Reads the labels of recordings from a table next to them: a row for each file, the file in the
 first column, its material and other fields in the others, whose names stand in the first row."""
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def _info(sweeps: Dataset) -> dict[str, Any]:
 
 
 def _columns(sweeps: Dataset, at: slice, *, texts: bool = False) -> dict[str, Array]:
-    """The columns of the sweeps `at`, a row for each frame. texts: also those of names."""
+    """The columns of the sweeps `at`, a row for each frame. texts: also the columns of names."""
     samples, numbers = sweeps.samples[at], np.arange(len(sweeps))[at]
     count, window = samples.shape[:2]
     frame = np.tile(np.arange(window, dtype=np.int64), count)

@@ -34,7 +34,7 @@ TACTMAT_HZ = 750.0
 the same laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
 SET_ARRAYS = ("samples", "labels", "materials", "displays", "rate_hz", "unloaded")
 NAMED_GROUPS = ("position", "session")
-"""Names that a recording can have beside its material. Each becomes a group."""
+"""Names that a recording can have next to its material. Each becomes a group."""
 SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 """Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
 SLIDE_UNITS = {"speed": "um/s", "force": "mN"}
@@ -45,7 +45,7 @@ FRAMES = (
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
 JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r", "metadata.yaml")
-"""Names of files and folders that systems and recorders leave beside recordings. Names that begin
+"""Names of files and folders that systems and recorders leave next to recordings. Names that begin
 with . or ~$ are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 
@@ -237,7 +237,7 @@ def check_folder(folder: Path) -> None:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """All files in and below a folder, in the order of their names, without those of JUNK. A Zarr
+    """All files in and below a folder, in the order of their names, without JUNK. A Zarr
     store counts as a file."""
     found = []
     for at, folders, names in os.walk(folder):

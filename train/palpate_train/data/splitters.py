@@ -54,9 +54,9 @@ def _random_folds(sweeps: Dataset, folds: int, seed: int) -> Iterator[Fold]:
 def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array:
     """The fold [N] of each sweep: whole groups, with the materials in equal shares.
 
-    Groups are dealt out in random order, those of the most unequal materials first. Each goes where
+    Groups are dealt out in random order, of the most unequal materials first. Each goes where
     the shares of the materials then differ least between folds, and of equal folds to the smallest.
-    The folds are those of scikit-learn's StratifiedGroupKFold with shuffling.
+    The folds are the same as of scikit-learn's StratifiedGroupKFold with shuffling.
     """
     kinds, label = np.unique(labels, return_inverse=True)
     values, member = np.unique(groups, return_inverse=True)

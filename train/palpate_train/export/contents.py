@@ -117,7 +117,7 @@ def _embedded(content: Content, samples: Array) -> Array:
 def golden_sweeps(sweeps: Dataset, logits: Array, logits_of_means: Array) -> Dataset:
     """One training sweep of the first and the last material.
 
-    It is the sweep with the median probability among those that both kinds of logits recognise:
+    It is the sweep with the median probability among all that both kinds of logits recognise:
     certain enough that rounding does not change its label, and not so certain that a small fault is
     hidden. Raises ExportRefused if none is recognised.
     """

@@ -117,7 +117,7 @@ def memory(folder: Path, sweeps: Array) -> float:
     with tempfile.TemporaryDirectory() as aside:
         path = Path(aside) / "sweeps.npy"
         np.save(path, sweeps[:SWEEPS_BEFORE_MEMORY])
-        # -P: the modules beside this file do not hide packages of their names
+        # -P: the modules next to this file do not hide packages of their names
         command = [sys.executable, "-P", __file__, str(folder), str(path)]
         env = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         env |= {"PYTHONPATH": str(Path(palpate.__file__).parents[1])}

@@ -218,7 +218,7 @@ def check_target(target: Path) -> None:
 
 @contextlib.contextmanager
 def _replacing(target: Path) -> Iterator[Path]:
-    """A new folder beside `target`, which replaces it if the block succeeds and is removed if it
+    """A new folder next to `target`, which replaces it if the block succeeds and is removed if it
     fails."""
     check_target(target)
     try:

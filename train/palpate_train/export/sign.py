@@ -58,8 +58,8 @@ def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
 
 
 def _with_labels(loaded: Bundle) -> dict[str, bytes]:
-    """Golden sweeps and class means with those of enrolled labels, as a bundle holds them without
-    an enrolment beside it."""
+    """Golden sweeps and class means, also of enrolled labels, as a bundle holds them without
+    an enrolment next to it."""
     assert loaded.classes
     return {
         bundle.GOLDEN: bundle.golden_file(

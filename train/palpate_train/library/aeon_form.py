@@ -16,7 +16,7 @@ Array = NDArray[Any]
 
 class AeonPalpateClassifier(BaseClassifier):  # type: ignore[misc]  # aeon has no types
     """PalpateClassifier with aeon's base class, without groups. X: [n, channels, time] of sweeps of
-    equal length. The parameters are those of PalpateClassifier.
+    equal length. The parameters are as for PalpateClassifier.
 
     After `fit`: palpate_ (the fitted PalpateClassifier).
     """

@@ -81,7 +81,7 @@ def outcomes_of(classifier: Classifier, sweeps: Dataset, lost: int = 0) -> dict[
 def labels_of(
     classifier: Classifier, sweeps: Dataset, *, fused: bool = False, lost: int = 0
 ) -> tuple[Array, Array]:
-    """The box's labels, int64 [N] into those of the bundle, or REFUSED or UNKNOWN; and bool [N],
+    """The box's labels, int64 [N] into the bundle's, or REFUSED or UNKNOWN; and bool [N],
     whether their status is ok. fused: each sweep gets the answer to its whole recording. lost: as
     for `verdicts`."""
     labels = classifier.bundle.manifest.labels

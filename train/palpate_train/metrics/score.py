@@ -59,7 +59,7 @@ def accuracy_figure(right: int, n: int) -> dict[str, Any]:
 
 @cache
 def provenance() -> dict[str, str]:
-    """The origin that a result file records beside its sets and seeds. shipped: the id of the
+    """The origin that a result file records next to its sets and seeds. shipped: the id of the
     packaged bundle.
 
     Cached at the first call, because the commit and the day may change during a long run.

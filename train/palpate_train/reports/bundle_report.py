@@ -105,7 +105,7 @@ def page(figures: Json, sweeps: Dataset) -> str:
 
 
 def _pictures(figures: Json) -> dict[str, Markup]:
-    """The pictures of the page by name; those that the figures allow."""
+    """The pictures of the page by name, as far as the figures allow."""
     pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
     if len(figures["labels"]) <= MOST_IN_MATRIX:
         pictures["confusion"] = html.picture(confusion(figures))

@@ -54,7 +54,7 @@ FILTERS: dict[str, Callable[..., str]] = {
         " ".join(text.split())
     ),  # what is escaped stays so, and is not escaped twice
 }
-"""Filters of all templates; those of PERCENT keep number and sign on one line of a page."""
+"""Filters of all templates; the filters of PERCENT keep number and sign on one line of a page."""
 
 
 def render(

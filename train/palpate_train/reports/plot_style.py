@@ -141,7 +141,7 @@ def set_ticks(
 ) -> None:
     """Ticks without strokes, labelled with their values times `factor`, the last one with the unit.
 
-    percent: the values are shares and shown as per cent. bare: no labels, for a plot beside a
+    percent: the values are shares and shown as per cent. bare: no labels, for a plot next to a
     labelled one.
     """
     unit, factor = ("%", 100.0) if percent else (unit, factor)

@@ -152,7 +152,7 @@ def _parts(figures: Any) -> Iterator[dict[str, Any]]:
 
 
 def _bundle(value: Any) -> list[str]:
-    """The id of a measured bundle, given alone or beside its name."""
+    """The id of a measured bundle, given alone or next to its name."""
     return _texts(value.get("id") if isinstance(value, dict) else value)
 
 

@@ -35,7 +35,7 @@ TITLES = {
     "classes": "materials distinguished",
 }
 COLUMNS = (1.42, 1.75, 2.05)
-"""Right ends of the columns of numbers beside `sizes`, as multiples of the plot's width."""
+"""Right ends of the columns of numbers next to `sizes`, as multiples of the plot's width."""
 
 
 def sizes(entries: Sequence[Json], chosen: str, wanted: float, about: str) -> str:

@@ -219,7 +219,7 @@ def _plain(value: Any) -> str:
 
 
 def draw(sweep: ShownSweep, plain: bool = True) -> str:
-    """The picture. plain: with its own colours instead of those of a page."""
+    """The picture. plain: with its own colours instead of a page's."""
     figure = Figure((WIDE, HIGH))
     page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(HIGH, 0))

@@ -407,7 +407,7 @@ def reduced(choice: Selection, change: Change) -> tuple[Fit, BundleCost]:
 def bundle_costs(
     fits: Mapping[str, Fit], sweeps: Dataset, log: Log
 ) -> tuple[dict[str, BundleCost], dict[str, str]]:
-    """The costs of the fits' bundles, measured in turns, and the reasons of those that cannot be
+    """The costs of the fits' bundles, measured in turns, and the reasons of bundles that cannot be
     packed."""
     refused: dict[str, str] = {}
     with tempfile.TemporaryDirectory() as aside:

@@ -116,7 +116,7 @@ WHOLE = {".mcap": _has_end, ".db3": _has_all_pages}
 
 
 def _fits(bag: Any, connections: list[Any]) -> bool:
-    """Whether the first message of a topic holds several numbers beside its header."""
+    """Whether the first message of a topic holds several numbers next to its header."""
     for connection, _, raw in bag.messages(connections=connections):
         try:
             message = bag.deserialize(raw, connection.msgtype)

@@ -86,7 +86,7 @@ def _evidence(cell: str) -> str:
 
 
 def _mixed_column(rows: Sequence[Row], split: Callable[[str], list[str]]) -> int | None:
-    """The first column, from 0, that holds numbers such as 1.012 beside whole numbers."""
+    """The first column, from 0, that holds numbers such as 1.012 next to whole numbers."""
     dotted: set[int] = set()
     whole: set[int] = set()
     for _, line in rows:

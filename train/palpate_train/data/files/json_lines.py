@@ -63,7 +63,7 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     """The list of frames in an object, and remarks; the object itself if it is a frame.
 
     An object holds a list for each column, as pandas writes them in four ways, or one list of
-    frames beside facts about them. Raises FormatError.
+    frames next to facts about them. Raises FormatError.
     """
     if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
         return _rows(list(map(str, whole["columns"])), "columns", whole["data"], "data"), []

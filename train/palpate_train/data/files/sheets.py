@@ -16,7 +16,7 @@ from palpate_train.data.files.table import ReadPlan, Table, normal
 
 SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 LEAST_FRAMES = 8
-"""With fewer rows, or a single column of numbers, a sheet beside others holds facts."""
+"""With fewer rows, or a single column of numbers, a sheet next to others holds facts."""
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:

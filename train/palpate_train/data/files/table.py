@@ -37,7 +37,7 @@ LONGEST = 40
 class ReadPlan:
     """What to read from a file. variable: the array, sheet, group or topic. time: the name of the
     times. decimal: the decimal sign of text, "" if the text must show it. names_only: read no
-    array, only the names of those that hold frames. fields: what --field asks for: columns, facts
+    array, only the names of arrays that hold frames. fields: what --field asks for: columns, facts
     or topics of text."""
 
     variable: str = ""
@@ -149,7 +149,7 @@ def unpacked(values: Array, attributes: Mapping[str, Any]) -> Array:
 
 
 def chosen(entries: Mapping[str, Entry], wanted: ReadPlan, ends: Sequence[int] = ()) -> Table:
-    """The only array of frames, or the array `wanted.variable`, with the times beside it, and
+    """The only array of frames, or the array `wanted.variable`, with the times next to it, and
     texts or numbers for each frame or recording that `wanted.fields` asks for. ends: as in Table.
 
     No other array is read. Raises FormatError that lists the arrays if none or several fit.

@@ -94,7 +94,7 @@ def lines_of(text: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Layout:
-    """How the lines of a text divide into cells. text_columns: those that hold words in most
+    """How the lines of a text divide into cells. text_columns: columns that hold words in most
     lines."""
 
     delimiter: str | None
@@ -295,7 +295,7 @@ def _stands_out(lines: Sequence[Row], layout: Layout) -> bool:
 
 def _is_count(found: Sequence[str]) -> bool:
     """Whether cells are numbers that rise by one each; more of them may have other even steps, or
-    those of rows and columns: 11, 12, 13, 14, 21, 22 ..."""
+    the steps of rows and columns: 11, 12, 13, 14, 21, 22 ..."""
     if len(found) < 2 or not all(map(is_number, found)):
         return False
     counts = np.array([float(plain(cell, ".")) for cell in found])
@@ -325,7 +325,7 @@ def _is_summary(found: Sequence[str], layout: Layout, at: int = 0) -> bool:
 
 
 def _untimed(found: Sequence[str], beside: Sequence[str]) -> bool:
-    """Whether a line lacks the first number, which the line beside it has."""
+    """Whether a line lacks the first number, which the line next to it has."""
     return not found[0].strip() and is_number(beside[0])
 
 
