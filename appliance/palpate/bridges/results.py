@@ -44,14 +44,10 @@ class Results:
                 before = [*verdicts.since(self._file, from_s, most)]
         if before:  # its writer may be off, or be late
             last_s, last = before[-1]["at"], before[-1]["sweep"]
-            ends = [i for i, (at, one) in enumerate(newest) if _same(at - last_s, one.sweep, last)]
+            same = (one.sweep == last and abs(at - last_s) < SAME_S for at, one in newest)
+            ends = [i for i, found in enumerate(same) if found]
             newest = newest[ends[-1] + 1 :] if ends else [e for e in newest if e[0] > last_s]
         names = [name for name in verdicts.COLUMNS if name != "at"]
         found = islice((e for e in newest if e[0] >= from_s), most - len(before))
         rows = [{"at": at, **{name: getattr(one, name) for name in names}} for at, one in found]
         return before + rows
-
-
-def _same(apart_s: float, sweep: int, other: int) -> bool:
-    """Whether two programs have heard the same result, at times so far apart."""
-    return sweep == other and abs(apart_s) < SAME_S

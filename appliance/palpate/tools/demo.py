@@ -151,15 +151,12 @@ class Demo:
 
     def _read(self, sent: int, wanted: int) -> None:
         """Read the sentences at the robot's end, up to `wanted` answers."""
-        while select.select([self._far_end], [], [], self._patience_s(sent))[0]:
+        while select.select([self._far_end], [], [], ARRIVAL_S * (self.score.answers < sent))[0]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:
                 self._show(line.decode("ascii"))
                 if self.score.answers == wanted:
                     return
-
-    def _patience_s(self, sent: int) -> float:
-        return ARRIVAL_S if self.score.answers < sent else 0
 
     def _show(self, line: str) -> None:
         if self._raw:

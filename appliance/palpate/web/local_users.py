@@ -23,7 +23,9 @@ Place = tuple[str, int]
 def owner(peer: Place, own: Place) -> int | None:
     """The uid of the user whose socket `peer` is connected to `own` here; None if it is not
     listed."""
-    wanted = {(_hex(peer, family), _hex(own, family)) for family in _families(peer[0])}
+    # a socket of IPv6 may carry IPv4
+    families = (socket.AF_INET6,) if ":" in peer[0] else (socket.AF_INET, socket.AF_INET6)
+    wanted = {(_hex(peer, family), _hex(own, family)) for family in families}
     for table in TABLES:
         with suppress(OSError):
             for line in table.read_text().splitlines()[1:]:
@@ -44,11 +46,6 @@ def may_see(uid: int | None) -> bool:
     except KeyError:
         return False
     return user.pw_gid == group.gr_gid or user.pw_name in group.gr_mem
-
-
-def _families(address: str) -> tuple[int, ...]:
-    """The families whose table may list an address; a socket of IPv6 may carry IPv4."""
-    return (socket.AF_INET6,) if ":" in address else (socket.AF_INET, socket.AF_INET6)
 
 
 def _hex(place: Place, family: int) -> str:

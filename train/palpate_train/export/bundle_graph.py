@@ -31,13 +31,12 @@ def bundle_graph(
     calibration: Calibration,
     trunk: onnx.ModelProto,
     prefixes: onnx.ModelProto | None = None,
-    known: bool = True,
 ) -> onnx.ModelProto:
     """The model of a bundle, from a trunk (float or int8): `sweep` -> `features` float32 [1, F].
 
     prefixes: the same trunk with the output `tenths` [1, D + 1, F]. Outputs: `logits` [1, K];
-    `early` [1, D, K] if there are prefixes and a rule; `embedding` [1, r] if `known`;
-    `early_embedding` [1, D, r] if both.
+    `early` [1, D, K] if there are prefixes and a rule; `embedding` [1, r];
+    `early_embedding` [1, D, r] with `early`.
     """
     model, steps = onnx.ModelProto(), None
     model.CopyFrom(trunk)
@@ -49,19 +48,16 @@ def bundle_graph(
     centred = _sixteen_bits(add, weight - weight.mean(1, keepdims=True), "head.weight")
     add("Gemm", whole, centred, bias - bias.mean(), output="logits")
     outputs: dict[str, list[int]] = {"logits": [1, len(bias)]}
-    if known or steps is not None:
-        _sixteen_bits(add, embedding.directions, DIRECTIONS)
-        if embedding.selected:
-            _sixteen_bits(add, embedding.turn, TURN)
-        model.graph.initializer.append(numpy_helper.from_array(embedding.offset, OFFSET))
+    _sixteen_bits(add, embedding.directions, DIRECTIONS)
+    if embedding.selected:
+        _sixteen_bits(add, embedding.turn, TURN)
+    model.graph.initializer.append(numpy_helper.from_array(embedding.offset, OFFSET))
     if steps is not None:
         _early(add, steps, _embedded(add, embedding, tenths[0], axis=2, output="head.each"))
         outputs["early"] = [1, len(steps.weight), len(bias)]
-        if known:
-            outputs[STEPS] = [1, len(steps.weight), len(embedding.offset)]
-    if known:
-        _embedded(add, embedding, whole, axis=1, output="embedding")
-        outputs["embedding"] = [1, len(embedding.offset)]
+        outputs[STEPS] = [1, len(steps.weight), len(embedding.offset)]
+    _embedded(add, embedding, whole, axis=1, output="embedding")
+    outputs["embedding"] = [1, len(embedding.offset)]
     del model.graph.output[:]
     for name, shape in outputs.items():
         model.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
