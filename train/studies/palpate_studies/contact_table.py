@@ -9,30 +9,15 @@ from palpate_studies import markdown
 from palpate_train.reports.formatting import estimate
 
 Json = dict[str, Any]
-HEAD = (
-    "skin moved",
-    "answered correctly",
-    "wrong label",
-    "`unsure`",
-    "`unknown`",
-    "marked",
-    "wrong and not marked",
-)
+# fmt: off
+HEAD = ("skin moved", "answered correctly", "wrong label", "`unsure`", "`unknown`", "marked",
+    "wrong and not marked")
 SHOWN = {
-    "rows": (
-        (0.0, "not at all"),
-        (1.0, "1 mm towards row 4"),
-        (2.0, "2 mm"),
-        (3.0, "3 mm"),
-        (4.0, "4 mm, one row"),
-        (5.0, "5 mm"),
-        (-4.0, "4 mm towards row 1"),
-    ),
-    "columns": (
-        (-4.0, "4 mm towards column 1"),
-        (4.0, "4 mm towards column 4"),
-    ),
+    "rows": ((0.0, "not at all"), (1.0, "1 mm towards row 4"), (2.0, "2 mm"), (3.0, "3 mm"),
+        (4.0, "4 mm, one row"), (5.0, "5 mm"), (-4.0, "4 mm towards row 1")),
+    "columns": ((-4.0, "4 mm towards column 1"), (4.0, "4 mm towards column 4")),
 }
+# fmt: on
 """Displacements in mm that have a line."""
 
 

@@ -59,26 +59,16 @@ def trusted(results: Json) -> str:
     left_out = f"simulated, each material left out in turn, n = {n}"
     other = f"simulated, other skins than in training, n = {n}"
     lost: Sequence[float] = [100 * early[key] for key in ("lost", "lost_low", "lost_high")]
-    rows = (
-        (
-            f"sweeps of untaught materials that get a label, where {percent(unknown['kept'])} of "
-            "taught ones get theirs",
-            percent(unknown["false_known"]),
-            left_out,
-        ),
+    # fmt: off
+    return _table((
+        (f"sweeps of untaught materials that get a label, where {percent(unknown['kept'])} of"
+            " taught ones get theirs", percent(unknown["false_known"]), left_out),
         ("part of the window until an early answer", percent(early["share"]), other),
-        (
-            "accuracy that early answers lose",
-            "{:.1f} points [{:.1f}, {:.1f}]".format(*lost),
-            other,
-        ),
-        (
-            "calibration error of the probability",
-            estimate((after["error"], after["low"], after["high"])),
-            other,
-        ),
-    )
-    return _table(rows)
+        ("accuracy that early answers lose", "{:.1f} points [{:.1f}, {:.1f}]".format(*lost), other),
+        ("calibration error of the probability",
+            estimate((after["error"], after["low"], after["high"])), other),
+    ))
+    # fmt: on
 
 
 TABLES = (
