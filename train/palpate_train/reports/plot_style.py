@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 from xml.sax.saxutils import escape
 
@@ -24,28 +24,18 @@ ORANGE, GREEN, PURPLE = "#b04a00", "#007a5e", "#8b3fb8"
 """Further colours for pictures with several; each has a contrast of at least 5 on the
 background."""
 ROLES = {
-    "accent": ACCENT,
-    "text": BLACK,
-    "grey": GREY,
-    "faint": FAINT,
-    "background": WHITE,
-    "orange": ORANGE,
-    "green": GREEN,
-    "purple": PURPLE,
+    "accent": (ACCENT, "#58a6ff"),
+    "text": (BLACK, "#e6edf3"),
+    "grey": (GREY, "#9ea7b3"),
+    "faint": (FAINT, "#343b44"),
+    "background": (WHITE, "#0d1117"),
+    "orange": (ORANGE, "#f0883e"),
+    "green": (GREEN, "#3fb68b"),
+    "purple": (PURPLE, "#c297ff"),
 }
-COLOURS = {colour: f"var(--{role}, {colour})" for role, colour in ROLES.items()}
+"""The colours of each role, for all and for readers who chose dark."""
+COLOURS = {colour: f"var(--{role}, {colour})" for role, (colour, _) in ROLES.items()}
 """The text in an SVG for each colour."""
-DARK_ROLES = {
-    "accent": "#58a6ff",
-    "text": "#e6edf3",
-    "grey": "#9ea7b3",
-    "faint": "#343b44",
-    "background": "#0d1117",
-    "orange": "#f0883e",
-    "green": "#3fb68b",
-    "purple": "#c297ff",
-}
-"""Colours of the same roles for readers who chose dark."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 WIDTH = 5.0
 """Inches, of 72 units each."""
@@ -55,13 +45,9 @@ PLACES = 2
 """Decimals of coordinates: a hundredth of a unit cannot be seen."""
 DIGITS = 6
 """Largest number of significant digits in a tick label."""
-
-
-def _variables(roles: Mapping[str, str]) -> str:
-    return " ".join(f"--{role}: {colour};" for role, colour in roles.items())
-
-
-LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
+LIGHT, DARK = (
+    " ".join(f"--{role}: {colours[look]};" for role, colours in ROLES.items()) for look in (0, 1)
+)
 AXIS = "axis:"
 """Prefix of the id of an axis with numbers while it is drawn; the axis title follows."""
 REWRITTEN = (

@@ -44,9 +44,11 @@ _OPTIONS: Mapping[str, tuple[Row, ...]] = {
 
 def register(add: Add) -> None:
     """Add all commands of this module."""
-    runs = (run_paper, run_development, run_fabrics, run_recipe)
-    for (name, rows), run in zip(_OPTIONS.items(), runs, strict=True):
-        command = add(name, run)
+    runs = {"development": run_development, "fabrics": run_fabrics}
+    measured = {"paper": paper_experiment.results, "recipe": recipe_views.results}
+    for name, rows in _OPTIONS.items():
+        command = add(name, runs.get(name, run_study))
+        command.set_defaults(results=measured.get(name))
         add_rows(command, *rows)
         add_out(command, name)
         add_rows(command, *[_DATA] * (name != "paper"), EFFORT, *WHERE)
@@ -65,22 +67,16 @@ def _done(run: StudyRun, path: Path) -> None:
     print(path)
 
 
-def run_paper(args: argparse.Namespace) -> None:
-    """Run the experiment and write its results."""
+def run_study(args: argparse.Namespace) -> None:
+    """Measure and write the results of a study that has no options of its own."""
     run = _run(args)
-    _done(run, save(args.out, paper_experiment.results(run)))
+    _done(run, save(args.out, args.results(run)))
 
 
 def run_fabrics(args: argparse.Namespace) -> None:
     """Evaluate and write the results."""
     names, run = options.names(args), _run(args)
     _done(run, save(args.out, fabrics_experiment.results(names, run)))
-
-
-def run_recipe(args: argparse.Namespace) -> None:
-    """Measure and write the results."""
-    run = _run(args)
-    _done(run, save(args.out, recipe_views.results(run)))
 
 
 def run_development(args: argparse.Namespace) -> None:
