@@ -31,7 +31,6 @@ for command; do :; done
 case "$command" in *{when}*) {what} ;; esac
 exec sh -c "$command"
 """
-SSHD = Path("/usr/sbin/sshd")
 
 
 class Ground:
@@ -415,7 +414,8 @@ def test_ssh_is_asked_without_questions(ground: Ground):
 @pytest.mark.slow
 def test_through_a_real_sshd(tmp_path: Path):
     """Keys, a login shell, the real tools: all is fetched; a wrong key connects not."""
-    if not SSHD.exists():
+    sshd = Path("/usr/sbin/sshd")
+    if not sshd.exists():
         pytest.skip("no sshd: apt-get install openssh-server")
     if os.getuid() == 0:
         Path("/run/sshd").mkdir(exist_ok=True)  # normally made by its service
@@ -430,7 +430,7 @@ def test_through_a_real_sshd(tmp_path: Path):
     lines += ["PasswordAuthentication no", "KbdInteractiveAuthentication no"]
     (tmp_path / "config").write_text("\n".join(lines) + "\n")
     # sshd takes one connection from a socket that ssh itself holds: no port is needed
-    proxy = f"ProxyCommand={SSHD} -i -f {tmp_path}/config"
+    proxy = f"ProxyCommand={sshd} -i -f {tmp_path}/config"
     options = [proxy, f"IdentityFile={tmp_path}/mine", f"UserKnownHostsFile={tmp_path}/known"]
     options += ["StrictHostKeyChecking=accept-new", "IdentityAgent=none"]
     reach = ["-F", "none", *(part for option in options for part in ("-o", option))]
