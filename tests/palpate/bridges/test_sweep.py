@@ -86,7 +86,7 @@ EARLY, LONG = result(1, share="0.40"), {"slide_s": LONG_S, "timeout_s": 2 * LONG
 
 
 class SweepCase(NamedTuple):
-    """lines: what the box says after its answer to a command. at: what happens in each phase.
+    """lines: what the box says after its answer to a command. at: events of each phase.
     wanted: status, or the error and its reason. heard: the commands of the box."""
 
     lines: dict[str, bytes] | None

@@ -135,7 +135,7 @@ def test_a_file_of_another_version_is_moved_aside(path, made):
 
 @pytest.mark.parametrize("how", ["damaged", "moved", "deleted"])
 def test_a_file_that_is_spoilt_while_it_is_written(path, how):
-    """What comes later is written to a new file."""
+    """Later verdicts are written to a new file."""
     file = VerdictFile(path)
     file.add(NOW, verdict(1))
     file.db.execute("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -280,7 +280,7 @@ def test_an_echo_with_changes_is_not_answered_without_end(change):
             clock.sleep_until(clock.now_ns() + 10**8)
         assert 8 <= answers <= 8 + 60 + 1
         os.write(robot, b"PPLP ID\r\nPPLP NO\r\n")
-        # a read returns what the terminal has passed on of several writes
+        # a read returns as much as the terminal has passed on
         found = [one for _ in range(10) for one in sink.commands() if one.name in ("ID", "NO")]
         assert [(command.name, bool(command.error)) for command in found] == [
             ("ID", False),

@@ -44,7 +44,7 @@ def store(words: list[str]) -> Any:
 
 
 def test_two_that_teach_at_once_share_no_folder(tmp_path):
-    """The second is refused while the first has it; what a power cut left is cleared."""
+    """The second is refused while the first has it; leftovers of a power cut are cleared."""
     (tmp_path / "teaching" / "old").mkdir(parents=True)
     place = Store(StoreConfig(folder=str(tmp_path)), prove=lambda bundle: None)
     with install._scratch(place) as first:

@@ -65,7 +65,7 @@ def test_an_event_is_not_kept_until_there_are_more(tmp_path):
     """Fewer bytes than nginx keeps by itself arrive at once."""
 
     def received(one: socket.socket, wanted: bytes) -> bytes:
-        """What comes, up to and with `wanted`."""
+        """Received bytes, up to and with `wanted`."""
         found = b""
         while wanted not in found:
             more = one.recv(4096)

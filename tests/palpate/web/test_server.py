@@ -163,7 +163,7 @@ def test_the_page_for_this_machine_and_no_more(page, asked, answer):
 def test_pages_run_in_browsers_of_2020_behind_any_path():
     """No younger script, and relative addresses."""
     absolute = re.compile(r"""(?:from|fetch\(|EventSource\(|href=|src=|replace\() ?["'`]/""")
-    # What scripts of Chromium 83 and Safari 14 lack
+    # Calls and signs that Chromium 83 and Safari 14 do not know
     young = re.compile(
         r"\w\.at\(|\?\?=|\|\|=|&&=|\.replaceChildren\(|replaceAll|AbortSignal\.timeout|findLast|hasOwn\b"
         r"|structuredClone|toSorted|toReversed|Promise\.any|checkVisibility"

@@ -227,7 +227,7 @@ def _sha256(path: Path) -> str | None:
 
 
 class _Bounded:
-    """A stream of a box, of which `left` bytes may still be read."""
+    """A stream of a box with `left` bytes to read."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream, self.left = stream, MAX_HEADERS

@@ -1,4 +1,4 @@
-"""One run of a program: what its parts receive only to hand it on."""
+"""One run of a program: values that its parts only hand on."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ Row = tuple[int, str]
 
 
 def decoded(data: bytes) -> tuple[str, list[str]]:
-    """The text, and remarks on what was dropped at its end."""
+    """The text, and remarks on bytes that were dropped at its end."""
     notes: list[str] = []
     if wide := _wide(data):
         return data.decode(wide, "replace").lstrip("\ufeff"), notes
