@@ -88,8 +88,10 @@ class Manifest(Rules):
         return f"taught here by {by}, {at} UTC by the box's clock"
 
     def json(self) -> bytes:
-        """The bytes of manifest.json; equal manifests give equal bytes."""
-        values = asdict(self) | {"format": self.format.json()}
+        """The bytes of manifest.json, without what the bundle lacks; equal manifests give equal
+        bytes."""
+        known = {name: value for name, value in asdict(self).items() if value is not None}
+        values = known | {"format": self.format.json()}
         if self.sliding and self.sliding.whole:
             del values["sliding"]["whole"]  # the usual
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
