@@ -124,13 +124,16 @@ def test_distances_of_zero_and_the_nearest_other_mean():
 
 
 def test_the_user_reads_both_shares():
-    """A line for known sweeps with the condition, a line for the others; a guess is called one."""
+    """A line for known sweeps with the condition, a line for the others, each with its number of
+    sweeps; a guess is called one."""
     guess = left_out()
     few = replace(guess, labels=guess.labels % 2)
     for sweeps, guessed in ((guess, False), (few, True)):
         found = {stranger_limits.FIGURES: limits({"force": sweeps}).figures}
         known, strangers = stranger_limits.lines(found)
+        assert f"of {np.isfinite(sweeps.known).sum()} known" in known
         assert "new force" in known
+        assert f"of {np.isfinite(sweeps.strangers).sum()} sweeps" in strangers
         assert ("guess" in strangers) == guessed
     assert stranger_limits.lines({}) == []
 

@@ -281,10 +281,12 @@ def lines(figures: Mapping[str, Any], limit: str = "balanced") -> list[str]:
     if not (found := figures.get(FIGURES)):
         return []
     shares, under = found[limit], " or ".join(found["under"])
-    told = [f"of known sweeps under a new {under} {_percent(shares['answered'])} are answered"]
+    known = f"of {found['known']} known sweeps under a new {under}"
+    told = [f"{known} {_percent(shares['answered'])} are answered"]
     if named := shares.get("named"):
         guess = " (a guess: few materials were left out)" if found["guess"] else ""
-        told.append(f"of materials that you did not teach {_percent(named)} get a label{guess}")
+        foreign = f"of {found['strangers']} sweeps of materials that you did not teach"
+        told.append(f"{foreign} {_percent(named)} get a label{guess}")
     if own := found.get(NOT_THIS):
         share = 100 * shares[NOT_THIS]
         told.append(f"of {own} sweeps of {NOT_THIS!r} {share:.0f} % get a label")
