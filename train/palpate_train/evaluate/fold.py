@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.storage import put
-from palpate.inference.session import graph_input, session
+from palpate.inference.session import session
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 
@@ -199,7 +200,8 @@ def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answ
     or the library of a method without a graph."""
 
     def given(counts: Array) -> Array:
-        return graph_input(method.input, counts, rate_hz)[None]
+        kind = method.input
+        return (counts if kind == "raw" else features.compute(kind, counts, rate_hz))[None]
 
     if method.library:
         return lambda counts: model.logits(given(counts))[0]
