@@ -1,7 +1,8 @@
-"""`python -m palpate_studies fabrics`: its tests, the results that it keeps, and its errors."""
+"""`python -m palpate_studies fabrics` and `shots`: tests, results that they keep, and errors."""
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate_studies import fabrics_experiment, matrix_table
+from palpate_studies import comparison, fabrics_experiment, matrix_table
 from palpate_studies.command import main
 from palpate_studies.development_experiment import FOUR
+from palpate_studies.study import StudyRun
 from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Where
 
 MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Linen", "WovenFabric")
 
@@ -90,3 +93,33 @@ def test_a_method_that_cannot_use_these_sweeps_is_named(
     assert run(data, method="H-svm,static-svm") == 0
     assert "H-svm: 40" in capsys.readouterr().out
     assert {r["method"] for r in results(data)} == {"static-svm"}
+
+
+@pytest.mark.slow
+def test_few_sweeps_of_each_material_are_trained_on(data: Path, monkeypatch: pytest.MonkeyPatch):
+    """Both seeds count every sweep of a test, and the lead is that of the same answers."""
+    monkeypatch.setattr(fabrics_experiment, "SHIPPED", "correlation-svm")
+    monkeypatch.setattr(fabrics_experiment, "SHOT_PEERS", ("static-svm",))
+    monkeypatch.setattr(fabrics_experiment, "EACH", (2, 3))
+    run = StudyRun(Where(1, cache=data / "cache"), lambda line: None, data, seeds=(1, 2))
+    made = fabrics_experiment.shots(run)
+    assert made["seeds"] == [1, 2]
+    tested = [(row["each"], len(row["materials"])) for row in made["rows"]]
+    assert tested == [(2, 7), (2, 4), (3, 7), (3, 4)]
+    for row in made["rows"]:
+        ours, peer = (row["methods"][name] for name in ("correlation-svm", "static-svm"))
+        assert ours["total"] == peer["total"] == {7: 56, 4: 64}[len(row["materials"])] * 2
+        gap, low, high = row["ahead"]["static-svm"]
+        assert gap == pytest.approx((ours["right"] - peer["right"]) / ours["total"], abs=1e-4)
+        assert low < gap < high
+    head, line, *rows = matrix_table.shots(made, at=3).split("\n")[2:]
+    assert head.count("|") == line.count("|") == rows[0].count("|") == 5
+    assert [row.partition(" classes")[0] for row in rows] == ["| 7", "| 4"]
+    assert comparison.shown(made["rows"][2]["ahead"]["static-svm"]) in rows[0]
+    monkeypatch.setattr(fabrics_experiment, "SHOT_PEERS", ("H-svm",))
+    with pytest.raises(FormatError, match="H-svm with 2 sweeps of a material: 40"):
+        fabrics_experiment.shots(run)
+    monkeypatch.setattr(fabrics_experiment, "EACH", (4,))
+    run.where = replace(run.where, kept=True)
+    with pytest.raises(FormatError, match="with 4 sweeps of a material folds are missing"):
+        fabrics_experiment.shots(run)

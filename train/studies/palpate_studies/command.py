@@ -17,6 +17,10 @@ PROGRAM = Program(
             "experiments",
             "evaluate methods on real fabrics, one condition left out at a time",
         ),
+        "shots": (
+            "experiments",
+            "evaluate methods on real fabrics with few sweeps of each material",
+        ),
         "recipe": (
             "experiments",
             "measure the cost of each view of the recipe, and which views sets ask for",

@@ -11,7 +11,7 @@ from palpate_studies import comparison, differences, markdown
 from palpate_studies.development_chart import PROTOCOLS
 from palpate_studies.method_names import plain_name
 from palpate_train.models.methods import SHIPPED
-from palpate_train.reports.formatting import estimate
+from palpate_train.reports.formatting import estimate, points
 
 Json = Mapping[str, Any]
 HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "verdict")
@@ -43,6 +43,23 @@ def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:
             what = f"{classes} classes: {PROTOCOLS.get(protocol, (protocol,))[0]}"
             rows.append([what, "removed" if removed else "kept", *_cells(line)])
     return markdown.table([cell.format(ours=plain_name(ours)) for cell in HEAD], rows)
+
+
+def shots(results: Json, at: int = 5) -> str:
+    """A line for each test of the study `shots`: accuracy in per cent of all methods by sweeps of a
+    material, and by how much ours is ahead of each peer with `at`."""
+    names, tests = list(map(plain_name, results["rows"][0]["methods"])), dict[str, list[str]]()
+    ahead: dict[str, list[str]] = {}
+    for row in results["rows"]:
+        test = f"{len(row['materials'])} classes: {PROTOCOLS[row['protocol']][0]}"
+        shares = (one["right"] / one["total"] for one in row["methods"].values())
+        tests.setdefault(test, []).append(" / ".join(map(points, shares)))
+        if row["each"] == at:
+            ahead[test] = [comparison.shown(gap) for gap in row["ahead"].values()]
+    numbers = dict.fromkeys(f"{row['each']} each" for row in results["rows"])
+    head = ("test", *numbers, *(f"{at} each: ahead of {name}" for name in names[1:]))
+    rows = [[test, *cells, *ahead[test]] for test, cells in tests.items()]
+    return markdown.table(head, rows, f"{' / '.join(names)}, per cent")
 
 
 def _cells(line: Json) -> list[str]:

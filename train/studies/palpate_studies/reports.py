@@ -77,6 +77,7 @@ REPORTS = (
     _study("alignment", folds=False),
     _study("certainty"),
     _study("fabrics", needs=(REAL,)),
+    _study("shots", needs=(REAL,)),
     _study("recipe", needs=(REAL,), folds=False),
     ResultFile(
         "stress-fabrics",

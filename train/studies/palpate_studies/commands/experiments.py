@@ -1,4 +1,4 @@
-"""The studies that compare methods or views: paper, development, fabrics, recipe.
+"""The studies that compare methods or views: paper, development, fabrics, shots, recipe.
 
 Each writes one file of results. `python -m palpate_studies pages` draws them.
 """
@@ -37,6 +37,7 @@ _OPTIONS: Mapping[str, tuple[Row, ...]] = {
             FLAG),
     ),
     "fabrics": (("--method", "(all)", text(_METHOD, "all")),),
+    "shots": (),
     "recipe": (),
 }
 # fmt: on
@@ -45,7 +46,11 @@ _OPTIONS: Mapping[str, tuple[Row, ...]] = {
 def register(add: Add) -> None:
     """Add all commands of this module."""
     runs = {"development": run_development, "fabrics": run_fabrics}
-    measured = {"paper": paper_experiment.results, "recipe": recipe_views.results}
+    measured = {
+        "paper": paper_experiment.results,
+        "shots": fabrics_experiment.shots,
+        "recipe": recipe_views.results,
+    }
     for name, rows in _OPTIONS.items():
         command = add(name, runs.get(name, run_study))
         command.set_defaults(results=measured.get(name))
