@@ -51,15 +51,19 @@ def shots(results: Json, at: int = 5) -> str:
     names, tests = list(map(plain_name, results["rows"][0]["methods"])), dict[str, list[str]]()
     ahead: dict[str, list[str]] = {}
     for row in results["rows"]:
-        test = f"{len(row['materials'])} classes: {PROTOCOLS[row['protocol']][0]}"
+        test = f"{len(row['materials'])} classes"
         shares = (one["right"] / one["total"] for one in row["methods"].values())
-        tests.setdefault(test, []).append(" / ".join(map(points, shares)))
+        tests.setdefault(test, []).append("/".join(map(points, shares)))
         if row["each"] == at:
             ahead[test] = [comparison.shown(gap) for gap in row["ahead"].values()]
-    numbers = dict.fromkeys(f"{row['each']} each" for row in results["rows"])
-    head = ("test", *numbers, *(f"{at} each: ahead of {name}" for name in names[1:]))
+    numbers = dict.fromkeys(row["each"] for row in results["rows"])
+    head = (
+        "sweeps of a material",
+        *map(str, numbers),
+        *(f"{at}: ahead of {name}" for name in names[1:]),
+    )
     rows = [[test, *cells, *ahead[test]] for test, cells in tests.items()]
-    return markdown.table(head, rows, f"{' / '.join(names)}, per cent")
+    return markdown.table(head, rows, f"{'/'.join(names)}, per cent:")
 
 
 def _cells(line: Json) -> list[str]:

@@ -109,6 +109,7 @@ TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     (RECIPE, "recipe", "recipe", recipe_page.table),
     ("docs/how-to/train.md", "rules", "rules", partial(rules_table.table, pairs=False)),
     (FABRICS, "matrix", "fabrics", matrix_table.headline),
+    (FABRICS, "shots", "shots", matrix_table.shots),
     *(("docs/explanation/figures.md", *one) for one in quantities.TABLES),
 )
 """Document, marker, name of the results in docs/data, and the function that makes the text."""
