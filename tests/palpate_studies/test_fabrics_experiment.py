@@ -117,7 +117,7 @@ def test_few_sweeps_of_each_material_are_trained_on(data: Path, monkeypatch: pyt
     assert [row.partition(" classes")[0] for row in rows] == ["| 7", "| 4"]
     assert comparison.shown(made["rows"][2]["ahead"]["static-svm"]) in rows[0]
     monkeypatch.setattr(fabrics_experiment, "SHOT_PEERS", ("H-svm",))
-    with pytest.raises(FormatError, match="H-svm with 2 sweeps of a material: 40"):
+    with pytest.raises(FormatError, match="H-svm, 2 sweeps each: 40"):
         fabrics_experiment.shots(run)
     monkeypatch.setattr(fabrics_experiment, "EACH", (4,))
     run.where = replace(run.where, kept=True)

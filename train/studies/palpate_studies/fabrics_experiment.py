@@ -69,7 +69,7 @@ def _shots_of(sweeps: Dataset, each: int, how: StudyRun, only: Sequence[str]) ->
     found = {}
     for one in evaluate.evaluate(sweeps, plan, how.where, how.log):
         if one.refused:
-            raise FormatError(f"{one.method} with {each} sweeps of a material: {one.refused}")
+            raise FormatError(f"{one.method}, {each} sweeps each: {one.refused}")
         found[one.method, one.seed] = sweeps.labels[one.test] == one.logits.argmax(1)
         clusters = sweeps.group(SHOT_PROTOCOL.removeprefix("leave:"))[one.test]
     if len(found) < len(names) * len(how.seeds):
