@@ -36,6 +36,7 @@ class Shown:
         )
         self.board = PageBoard(self._publish)
         self._box: object = None
+        self._one_by_one = threading.Lock()  # no beat repeats the state before
         self._ended = threading.Event()
         self._beating = threading.Thread(target=self._beat)
 
@@ -50,14 +51,16 @@ class Shown:
         self.server.__exit__(*reason)
 
     def _publish(self, name: str, content: object) -> None:
-        if name == "box":
-            self._box = content
-        self.server.publish(name, content)
+        with self._one_by_one:
+            if name == "box":
+                self._box = content
+            self.server.publish(name, content)
 
     def _beat(self) -> None:
         while not self._ended.wait(0.5):
-            if self._box:
-                self.server.publish("box", self._box)
+            with self._one_by_one:
+                if self._box:
+                    self.server.publish("box", self._box)
 
     def _answers(self) -> dict[str, Answer]:
         """The answers of `palpate watch`. History comes from the file `memory`."""
