@@ -10,8 +10,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from palpate.bundle.bundle import Bundle
 from palpate.client.answers import Answer
 from palpate.core import sentences
 from palpate.core.config import FEED
@@ -19,32 +21,38 @@ from palpate.core.runtime_folder import STATUS
 from tests.factories.browser import BrowsedPage, until
 from tests.factories.paths import ROOT
 
-pytestmark = pytest.mark.slow  # in real time
+pytestmark = pytest.mark.slow  # in real time or slower
 FINGERS = ("left", "right")
-START = (
-    "import sys; from pathlib import Path; from palpate.core import config;"
-    "config.SITE = Path(sys.argv.pop(1)); from palpate.cli.main import main; sys.exit(main())"
-)
-"""`palpate` with its settings elsewhere than in /etc."""
+SWEEPS = 200
 LIMIT_S = 120
 
 
 class Pair:
-    """The units of a box with two fingers, in `folder`."""
+    """The units of a box with two fingers, in `folder`. Both slide over one material, however long
+    after the other a busy machine starts one: a sweep of `model` that it is sure of."""
 
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
+    def __init__(self, folder: Path, stack: ExitStack, model: Bundle) -> None:
         self._folder, self._stack = folder, stack
+        np.savez(
+            folder / "good.npz",
+            samples=np.repeat(model.golden[:1], SWEEPS, axis=0),
+            labels=np.zeros(SWEEPS, int),
+            materials=["good"],
+            rate_hz=model.format.rate_hz,
+            group_recording=np.zeros(SWEEPS, int),
+        )
         for name in FINGERS:
             (folder / name).mkdir()
             keys = f'runtime = "{folder / name}"\nfolder = "{folder / name}-store"\n'
             (folder / f"{name}.toml").write_text(f"[store]\n{keys}")
-            self.start(*self.words("run", name), "--sim", "skin", "--sweeps", "999")
+            self.start(*self.words("run", name), "--sim", f"replay:{folder / 'good.npz'}")
         until(lambda: all((folder / name / STATUS).exists() for name in FINGERS), LIMIT_S)
 
     def words(self, command: str, name: str) -> list[str]:
         """The command for a finger."""
         site = str(self._folder / "palpate.toml")
-        return [sys.executable, "-c", START, site, command, "--unit", name]
+        unit = "tests.factories.paced_unit"
+        return [sys.executable, "-m", unit, site, command, "--unit", name]
 
     def start(self, *words: str, **more: Any) -> subprocess.Popen[str]:
         """Start a program, which ends with the test."""
@@ -75,10 +83,10 @@ class Pair:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+def pair(tmp_path_factory: pytest.TempPathFactory, default_bundle: Bundle) -> Iterator[Pair]:
     """Two units that run."""
     with ExitStack() as stack:
-        yield Pair(tmp_path_factory.mktemp("pair"), stack)
+        yield Pair(tmp_path_factory.mktemp("pair"), stack, default_bundle)
 
 
 def test_a_good_pair_is_answered_as_one_hand(pair: Pair):
