@@ -39,12 +39,13 @@ MOST_UNKNOWN = 0.5
 LEAST_KEPT = {"strict": 1 - MOST_UNKNOWN, "balanced": 1 - MOST_UNKNOWN, "loose": 0.9}
 """Least share of known sweeps within each limit, at any cost; the largest is KEPT. A box that
 refuses more is of no use; a wider limit only lets strangers in."""
-FEW_SWEEPS, LEAST_OF_FEW, LEAST_BY_JUNK = 50, 0.7, 0.85
+FEW_SWEEPS, LEAST_OF_FEW, LEAST_OF_GUESS, LEAST_BY_JUNK = 50, 0.7, 0.9, 0.85
 """Up to this number of sweeps of a material, the balanced limit keeps such a share. Few sweeps say
 too little of strangers to give up more known sweeps for them, and their cross-fits are farther away
 than new sweeps of the finished model. Of .5 to .95, .7 had the least cost on nine simulated sets.
-With junk made of them, more: from 3 to 8 sweeps, .7 would answer 6 to 12 points less at a new
-place (simulated)."""
+Up to FEW materials say still less; with .7 three materials of 20 sweeps lost 15 to 18 points of
+known sweeps for 11 to 19 of unknown ones (simulated). With junk made of up to ten sweeps, .7 would
+answer 6 to 12 points less at a new place."""
 FEW_STRANGERS = 3
 """This number of sweeps of NOT_THIS counts half as much as many do: a single one may be a slip."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
@@ -170,7 +171,7 @@ def limits(
     wrong = named + _share_below(grid, made) + weight * _share_below(grid, own)
     most, chosen, least_kept = int(np.argmax(kept >= KEPT)), {}, dict(LEAST_KEPT)
     if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
-        least_kept["balanced"] = LEAST_BY_JUNK if made else LEAST_OF_FEW
+        least_kept["balanced"] = _least_of_few(len(known.by_material), bool(made))
     for name, cost in COSTS.items():
         cheapest = _cheapest(kept, wrong, stranger_cost * cost)
         least = int(np.argmax(kept >= least_kept[name]))
@@ -191,6 +192,13 @@ def limits(
             figures[NOT_THIS] = len(logs)
             figures[name][NOT_THIS] = round(float(np.mean(logs <= np.log(limit))), 4)
     return StrangerLimits(**chosen, figures=figures)
+
+
+def _least_of_few(materials: int, junk: bool) -> float:
+    """The least share of known sweeps that the balanced limit of few sweeps keeps."""
+    if junk:
+        return LEAST_BY_JUNK
+    return LEAST_OF_GUESS if materials <= FEW else LEAST_OF_FEW
 
 
 def _by_condition(
