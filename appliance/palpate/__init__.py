@@ -1,4 +1,4 @@
-"""Palpate: names the material that a robot's tactile skin has just swept over. `python -m palpate
+"""Palpate: tells which material a robot's tactile skin has just swept over. `python -m palpate
 --help`."""
 
 import os

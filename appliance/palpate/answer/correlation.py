@@ -35,7 +35,7 @@ class Correlations:
         check(self, "correlations")
 
     def within(self, found: tuple[float, float]) -> bool:
-        """Whether the correlations of a window are those of a slide."""
+        """Whether the correlations of a window are as high as in a slide."""
         return found[0] >= self.frames and found[1] >= self.taxels
 
     def judges(self, given: StageInputs) -> list[Stage]:

@@ -144,7 +144,7 @@ class Disturbances:
         check(self, "disturbances")
 
     def sizes(self, values: Mapping[str, float]) -> list[float]:
-        """Sizes [D] of the disturbances of a sweep. values: by name; one that is missing is not
+        """Sizes [D] of the disturbances of a sweep. values: by name; a missing value is not
         known."""
         return [a.size(values.get(a.of, math.nan)) for a in self.allowances]
 

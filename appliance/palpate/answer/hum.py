@@ -27,10 +27,10 @@ from palpate.core.types import SweepFormat, digitized, normal
 Array = NDArray[Any]
 MAINS_HZ = (50.0, 60.0)
 ASIDE = (3, 4, 5)
-"""Distances of the frequencies beside a line to which it is compared, in periods per window. A Hann
+"""Distances from a line to the frequencies to which it is compared, in periods per window. A Hann
 window keeps a line within two."""
 ONE_IN = 4
-"""A line is searched in one of so many taxels: those that vibrate least beside its frequency,
+"""A line is searched in one of so many taxels: the taxels that vibrate least near its frequency,
 because all taxels have the same hum."""
 IN_PHASE = 0.9
 """Least length of the sum of the taxels' amplitudes, as a share of the sum of their lengths."""
@@ -49,9 +49,9 @@ OFF_HZ, STEPS = 0.3, 13
 class HumLines:
     """The lines that a window of some length can show.
 
-    hz, mains, order: [L], frequency, that of the mains, and the multiple. waves: at each line and
+    hz, mains, order: [L], frequency, mains frequency, and the multiple. waves: at each line and
     at frequencies around it, F = L * (1 + 2 * len(ASIDE)). powers: float32 [2 * L, 2 * F], gives
-    the power at each line, and then its mean beside each line, of squares of `waves`.
+    the power at each line, and then its mean around each line, of squares of `waves`.
     """
 
     hz: Array
@@ -92,9 +92,9 @@ class HumFilter:
         self.hz = tuple(sorted(set(self._of(format.window).mains.tolist())))
 
     def ratio(self, taxels: Counts) -> float:
-        """How much the hum of one window stands out: the amplitude of a line by those beside it. 0
-        without a line in phase. taxels: raw counts [T, R, C] or [T, R, C, A]; only the normal axis
-        is used."""
+        """How much the hum of one window stands out: the amplitude of a line, divided by the
+        amplitudes around it. 0 without a line in phase. taxels: raw counts [T, R, C] or
+        [T, R, C, A]; only the normal axis is used."""
         window = Window.of(taxels)
         return float(self._ratios(self._of(len(window)), window).max(initial=0.0))
 
@@ -121,11 +121,11 @@ class HumFilter:
         context.taxels, context.hum = self(context.window, self._least)
 
     def _of(self, frames: int, *, comb: bool = False) -> HumLines:
-        """The lines of windows of this length: those that are searched, or all."""
+        """The lines of windows of this length: the searched lines, or all."""
         lines = self._lines.get((frames, comb))
         if lines is None:
             lines = HumLines.of(frames, self._rate_hz, MULTIPLES if comb else SEARCHED)
-            if frames == self._frames or not comb:  # those of unfinished hummed windows are large
+            if frames == self._frames or not comb:  # lines of unfinished hummed windows are large
                 self._lines[frames, comb] = lines
         return lines
 

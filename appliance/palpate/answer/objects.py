@@ -152,7 +152,7 @@ class ObjectSweeps:
         self._labels = labels
 
     def apply(self, context: Context) -> Refusal | None:
-        """Fuse one more sweep with those of its object, and refuse one that contradicts them."""
+        """Fuse a sweep with the earlier sweeps of its object; refuse it if it contradicts them."""
         sweep, own, earlier = context.sweep, context.probabilities, self.present
         if sweep.object == 0 or sweep.object != earlier.object or self.rule.fuse == "none":
             earlier = FusedSweeps(sweep.object)

@@ -33,7 +33,7 @@ class Stages(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """The parameters of each rule, None for one that the bundle lacks, in the order in which rules
+    """The parameters of each rule, None if the bundle lacks the rule, in the order in which rules
     judge and are left out on trial.
 
     disturbances: noise, load, speed, lost frames and hum. displacement: contacts elsewhere. speeds:

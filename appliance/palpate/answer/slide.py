@@ -40,7 +40,7 @@ Array = NDArray[Any]
 BAND_HZ = 40.0
 """Highest frequency that is used. Friction vibrations are mostly above it; they have no lag."""
 LEAST_CYCLES = 2
-"""Fewest cycles of a frequency in a window. Slower changes are those of the force."""
+"""Fewest cycles of a frequency in a window. Slower changes come from the force."""
 WAVES = 2.0
 """Waves per taxel pitch of the finest pattern that is used: a taxel blurs finer patterns."""
 SEPARATIONS = 3
@@ -246,7 +246,7 @@ def _pairs(rows: int, cols: int) -> tuple[Array, Array]:
 
 def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:
     """The block of `shape` of frames [T, R, C] whose counts change most, judged by 64 frames. A
-    loud taxel counts like the median of those that change."""
+    loud taxel counts like the median of the changing taxels."""
     some = taxels[:: max(1, len(taxels) // 64)].astype(np.float64)
     moving = np.nan_to_num(some.std(axis=0))
     if moving.any():

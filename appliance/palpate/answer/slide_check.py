@@ -37,7 +37,7 @@ class SlideCheck:
 
     tare: counts [R, C] or [R, C, A] of the unloaded skin. contact: least load of a taxel in counts,
     None if it is unknown. limits: least vibrations of the known materials, None if they are
-    unknown. patterned: whether slides on this skin show a pattern, as those of training did;
+    unknown. patterned: whether slides on this skin show a pattern, as in training;
     SlideMeter measures it.
     """
 

@@ -195,8 +195,8 @@ def places(mask: Mask) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """A stretch of the signal, each value of a frame beside the values of its neighbours on the
-    same axis.
+    """A stretch of the signal, each value of a frame with the values of its neighbours on the same
+    axis.
 
     noise, still: of the value, [R * C, A], see Window. around: median noise of the
     neighbours that are not still, [R * C, A]; infinite if there are none. Of an even number the
@@ -308,8 +308,8 @@ def bridged(
 def _weights(
     rows: int, cols: int, mask: bytes
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Broken taxels [B], the sound taxels [S] beside them, and weights [B, S] that give each broken
-    taxel the mean of its direct neighbours, which may be broken, too."""
+    """Broken taxels [B], the sound taxels [S] next to them, and weights [B, S] that give each
+    broken taxel the mean of its direct neighbours, which may be broken, too."""
     broken = np.frombuffer(mask, bool)
     r, c = np.divmod(np.arange(rows * cols), cols)
     beside = np.abs(r[:, None] - r) + np.abs(c[:, None] - c) == 1

@@ -192,7 +192,7 @@ class EarlyDistances:
 
 
 class UnknownSweeps:
-    """The latest sweeps of unknown materials, to notice one that comes again."""
+    """The latest sweeps of unknown materials, to notice a material that comes again."""
 
     def __init__(self, distances: ClassDistances) -> None:
         self._distances = distances
@@ -341,7 +341,7 @@ class ClassDistances:
 
 class KnownMaterial:
     """Refuses a sweep that is too far from every known material; joins the logits of the network
-    with those of the enrolled labels.
+    with the logits of the enrolled labels.
 
     displaced: for sweeps whose contact is displaced, None without a rule for them. Neither a
     displacement nor a disturbance makes a material unknown.

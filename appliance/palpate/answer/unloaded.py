@@ -75,7 +75,7 @@ class UnloadedTracker:
         self._frames = 0
 
     def set(self, taxels: NDArray[Any]) -> None:
-        """Take these frames [n, R, C] as those of an untouched skin, as a person has said."""
+        """Take these frames [n, R, C] as an untouched skin, as a person has said."""
         self.skin, self.certain, self._given = UnloadedSkin.measured(taxels), True, True
 
     def put(self, taxels: NDArray[Any]) -> None:

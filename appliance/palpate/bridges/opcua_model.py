@@ -47,7 +47,7 @@ RESULT: Mapping[str, ua.VariantType] = {
     "LastResult.ResultId": KINDS.String,
 }
 """Variables of the last result, and fields of its event; ResultId is written last, so whoever reads
-the others after its change has those of one result."""
+the others after its change has the values of a single result."""
 REPLY = "VisionStateMachine.LastReply"
 VARIABLES = {**STATE, REPLY: KINDS.String, **RESULT}
 """All variables by their paths."""

@@ -1,5 +1,5 @@
-"""The results that a client of a bridge has missed: the newest from memory, older ones and those of
-before a restart from the file of verdicts (client/verdicts.py)."""
+"""The results that a client of a bridge has missed: the newest from memory, older results and
+results before a restart from the file of verdicts (client/verdicts.py)."""
 
 from __future__ import annotations
 

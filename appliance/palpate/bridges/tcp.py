@@ -1,6 +1,6 @@
 """The serial line over TCP, for controllers with sockets, for example URScript. Each peer gets all
-sentences. Commands of the peers go to the box one at a time, though not behind one that waits for
-the box's disk, and the answer goes to the peer that sent the command."""
+sentences. Commands of the peers go to the box one at a time, though not behind a command that
+waits for the box's disk, and the answer goes to the peer that sent the command."""
 
 from __future__ import annotations
 

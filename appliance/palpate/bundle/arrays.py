@@ -23,7 +23,7 @@ from palpate.core.types import SweepFormat
 def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
     """The arrays of the .npz `data` by name.
 
-    names: arrays that must be there. Pickled objects are refused. Raises a BundleError that names
+    names: arrays that must be there. Pickled objects are refused. Raises a BundleError about
     `file`.
     """
     try:
@@ -72,7 +72,7 @@ def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
 
 def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
     """Sweeps from the bytes of their changes [B, G, T, R, C] or [B, G, T, R, C, A]: the inverse of
-    `changes`. Raises a BundleError that names `file`."""
+    `changes`. Raises a BundleError about `file`."""
     size = f.numpy_type.itemsize
     if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (
         size,

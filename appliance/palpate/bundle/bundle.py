@@ -101,7 +101,7 @@ def load(folder: Path) -> Bundle:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """The files of the bundle in `folder` by name: the manifest, the files that it names, and the
+    """The files of the bundle in `folder` by name: the manifest, the files that it lists, and the
     files of EXTRA_FILES that exist.
 
     Other files are ignored. Links are not followed, and no file is read beyond the size in the

@@ -45,13 +45,13 @@ class AddedLabels:
     displays: tuple[str, ...]
 
     def only(self, kept: Sequence[int]) -> AddedLabels:
-        """The labels with these indices; the logits are still those of all."""
+        """The labels with these indices; the logits of all labels stay."""
         lists: dict[str, Any] = {name: getattr(self, name)[kept] for name in _LISTS}
         labels, displays = (tuple(of[k] for k in kept) for of in (self.labels, self.displays))
         return replace(self, labels=labels, displays=displays, **lists)
 
     def plus(self, other: AddedLabels) -> AddedLabels:
-        """These labels and those of `other`, with its logits and its rule."""
+        """These labels and the labels of `other`, with the logits and the rule of `other`."""
         lists: dict[str, Any] = {
             name: np.concatenate([getattr(one, name) for one in (self, other)]) for name in _LISTS
         }

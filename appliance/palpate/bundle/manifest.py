@@ -176,7 +176,7 @@ def _wrong_files(files: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _wrong_names(labels: tuple[str, ...], displays: Mapping[str, str]) -> Iterator[str]:
-    """Fewer than two labels, equal ones and those that cannot be sent; and a display name that
+    """Fewer than two labels, equal labels, and labels that cannot be sent; and a display name that
     cannot be shown, or that belongs to no label."""
     if len(labels) < 2 or len(set(labels)) < len(labels):
         yield f"labels {list(labels)} must be at least two different names"

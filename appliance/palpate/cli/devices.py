@@ -32,7 +32,7 @@ def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | N
 
 
 def open_any(args: argparse.Namespace, settings: Config) -> Devices:
-    """The devices. A simulated skin has the bundle's format, if there is one that it can send."""
+    """The devices. A simulated skin has the format of the bundle if there is one and it fits."""
     try:
         return open_devices(args, lambda: load_bundle(settings, answers=False).format)
     except (BundleError, FormatError):

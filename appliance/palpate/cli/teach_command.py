@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_key(settings: Config) -> None:
     """Raises ConfigError before anything is recorded, if nothing could be taught. A folder of keys
-    that a person names gets a key."""
+    that a person chooses gets a key."""
     key = EnrolmentKey(settings.store.enrolment_key)
     if settings.sources["store.keys"] == "--set" and key.make():
         log.info(f"teach: {key.folder} has a new key; run with the same --set store.keys")

@@ -41,7 +41,7 @@ class Answer:
     """The answer to one sweep, with the fields of RES. Probability and margin are 0 to 1.
 
     time_s: of the box's monotonic clock. lost: number of lost frames in the window. loss_known:
-    whether lost frames can be seen. missed: number of answers before this one that did not arrive,
+    whether lost frames can be seen. missed: number of answers lost just before this answer,
     counted by the numbers of the sweeps. measured_mm_s, direction: of the slide as the box measured
     it, `rows+`, `rows-`, `cols+` or `cols-` for the direction; None and "" if it was not measured.
     finger: of an answer of one finger, else "". fingers: the answers that a hand's answer was fused

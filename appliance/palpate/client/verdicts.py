@@ -158,7 +158,7 @@ class VerdictFile:
 
 
 Source = Path | sqlite3.Connection
-"""A file of verdicts, or one that is open in this process."""
+"""A file of verdicts, or a database that is open in this process."""
 
 
 def dated(line: Mapping[str, Any], now_ns: int) -> tuple[float, dict[str, Any]]:

@@ -1,8 +1,8 @@
 """The settings of the box, from TOML files and `--set` options.
 
 Layers, each overriding the layers before it: the defaults below, `skin.toml`, `board-NAME.toml`,
-`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: types and limits of their
-fields are those of the files. Each value has its source.
+`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: the files have the types
+and limits of their fields. Each value has its source.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def is_default() -> bool:
 
 
 def _speaks_of_it(path: str) -> bool:
-    """Whether a settings file may set store.runtime; one that cannot be read may."""
+    """Whether a settings file may set store.runtime; an unreadable file may."""
     try:
         with open(path, "rb") as f:
             return b"runtime" in f.read()

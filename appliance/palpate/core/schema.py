@@ -47,7 +47,7 @@ def fixed(value: _Kind) -> _Kind:
 
 
 def gpio_line() -> str:
-    """A field that names a GPIO line; "" means not wired."""
+    """A field with the name of a GPIO line; "" means not wired."""
     return field(default="", metadata={"line": True})
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 TALKER = "PPLP"
 OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
-"""Kinds of sentences that the box sends; one that comes back is an echo and is not answered."""
+"""Kinds of sentences that the box sends; if one comes back, it is an echo and is not answered."""
 MOST_FINGERS = 4
 """Largest number of fingers of a hand."""
 MAX_LINE = 128

@@ -17,7 +17,7 @@ SITE = Path(runtime_folder.SITE)
 
 class Layers(NamedTuple):
     """The layers, each overriding the layers before it, as (where, table). board: the board file's
-    name, "" for none. named_in: "--board", the file that names it, or "code". folder: where
+    name, "" for none. named_in: "--board", the file that gives it, or "code". folder: where
     `skin.toml` and the boards' files are."""
 
     board: str

@@ -215,7 +215,7 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
 
 
 def _displays(materials: tuple[str, ...], given: Array | None, source: str) -> dict[str, str]:
-    """Display names by material; one that is empty or equal to the name is none."""
+    """Display names by material; an empty text, or the name itself, is none."""
     if given is None:
         return {}
     if given.dtype.kind != "U" or given.shape != (len(materials),):

@@ -31,7 +31,7 @@ FIRST = ("data/current", "data/bundles.json")
 LEFT_OUT = re.compile(
     r"settings/watch/(key|certificate)\.pem|data/(incoming|teaching)(/.*)?|.*\.(part|new)"
 )
-"""Files of this host alone, and those of unfinished work."""
+"""Files of this host alone, and files of unfinished work."""
 END, SCHEMA = "digests.json", 1
 BEFORE = ".before-restore"
 """Suffix of the folders that a restore has replaced."""
@@ -97,7 +97,7 @@ def _add(tar: tarfile.TarFile, path: Path, name: str, digests: dict[str, str]) -
 
 
 def unpack(source: IO[bytes], root: Path = Path("/")) -> dict[str, Path]:
-    """Unpack a backup beside the folders of the box and check it; returns the new folder of each
+    """Unpack a backup next to the folders of the box and check it; returns the new folder of each
     part, synced, for `swap`.
 
     Settings that the backup lacks stay as they are on this box. Raises FormatError if the backup is
@@ -130,7 +130,7 @@ def unpack(source: IO[bytes], root: Path = Path("/")) -> dict[str, Path]:
 
 
 def swap(new: dict[str, Path], root: Path = Path("/")) -> None:
-    """Put unpacked folders in the place of the box's, whose content stays beside them. Raises
+    """Put unpacked folders in the place of the box's, whose content stays next to them. Raises
     OSError; a second restore completes the first."""
     for part, folder in new.items():
         old = root / PARTS[part][1:]

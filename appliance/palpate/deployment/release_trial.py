@@ -38,7 +38,7 @@ KEPT, EVERY = 50, 10
 """Sweeps of a start that are compared, and new ones for each comparison. A release 3 points worse
 answers 6 % of sweeps otherwise, so 50 show it 19 times of 20."""
 COMPARED_S = 60.0
-"""Time for a comparison, which goes on beside the loop at the lowest priority."""
+"""Time for a comparison, which runs at the lowest priority while the loop goes on."""
 OTHERWISE = 3
 """Exit code of palpate.runtime.replay if answers differ."""
 

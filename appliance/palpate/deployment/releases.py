@@ -118,7 +118,7 @@ class Releases:
 
     @property
     def trial(self) -> RootState | None:
-        """The trial of the current release; None for one that is proven."""
+        """The trial of the current release; None for a proven release."""
         held, counted = _state(self._trial), _state(self._counts)
         if not held or held.release != self.current:
             return None

@@ -1,4 +1,4 @@
-"""Shadow mode: a candidate bundle classifies beside the current bundle, before it is committed.
+"""Shadow mode: a candidate bundle classifies along with the current bundle, before it is committed.
 
 Shadow mode counts how often the candidate agrees and keeps the sweeps on which it does not. The
 candidate cannot affect the robot, since it gets a sweep only after the answer was sent.
@@ -40,7 +40,7 @@ SLOW_NS = 100_000_000
 wait for it."""
 MOST_MODELS = 20 << 20
 """Bytes that both models may have together. The paper's network in int8 has 16 MB, and needs 25 MB
-beside the 60 of the service, which may have 256 MB (systemd/palpate.service)."""
+besides the 60 of the service, which may have 256 MB (systemd/palpate.service)."""
 STARTS = 3
 """After this many starts in a row that did not last PERIOD_NS, the candidate is no longer
 loaded."""
@@ -270,7 +270,7 @@ class Shadow(Observer):
             )
 
     def _beside(self, act: Callable[[], object], *, of_first: bool = False) -> None:
-        """Do `act` beside the loop, if that is possible now. of_first: it keeps the first of the
+        """Do `act` next to the loop, if that is possible now. of_first: it keeps the first of the
         waiting sweeps, which waits no longer then."""
 
         def done(succeeded: bool) -> None:

@@ -118,8 +118,8 @@ class StoreState:
     """State of all bundles in the store.
 
     counter, highest: the highest counter that was ever committed, and its bundle. candidate: the
-    bundle that classifies beside the current bundle in `palpate run --shadow`, PACKAGED without a
-    candidate.
+    bundle that classifies along with the current bundle in `palpate run --shadow`, PACKAGED without
+    a candidate.
     """
 
     counter: int = 0

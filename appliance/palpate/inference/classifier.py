@@ -70,7 +70,7 @@ class Classifier(Observer):
 
     If the contact is displaced and the bundle has a rule for displacement, the rule's distances,
     limit, temperature and least probability apply. An unknown sweep is not fused: it has no
-    probabilities, and one touch beside the object must not invalidate the other sweeps.
+    probabilities, and one touch next to the object must not invalidate the other sweeps.
 
     settings: a min_probability of 0 becomes the bundle's thresholds.unsure. slides: whether answers
     have the speed of the slide; without it they take less time. model: of a classifier with the
@@ -210,8 +210,8 @@ class Classifier(Observer):
         return worst
 
     def refusals(self) -> list[Status]:
-        """The status of each golden sweep of trained labels that the stages refuse, ok for one that
-        gets a label. The stream does not count: neither its tare nor its broken taxels."""
+        """The status of each golden sweep of trained labels that the stages refuse, ok for a sweep
+        with a label. The stream does not count: neither its tare nor its broken taxels."""
         m, present, found = self.bundle.manifest, self._objects.present, []
         taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
         stages = [taxels, *(one for one in self._stages if one is not self.taxels)]

@@ -131,7 +131,7 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
 
 
 def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
-    """A LineError that explains an errno and names the GPIO lines."""
+    """A LineError that explains an errno and lists the GPIO lines."""
     advice = _ADVICE.get(e.errno or 0, "see the kernel log (dmesg)")
     return LineError(
         f"cannot {doing} gpio lines {', '.join(names)}: {e.strerror} (errno {e.errno}); {advice}"
@@ -140,7 +140,7 @@ def line_error(doing: str, names: Iterable[str], e: OSError) -> LineError:
 
 @contextmanager
 def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
-    """Turn an OSError into a LineError that names the GPIO lines."""
+    """Turn an OSError into a LineError that lists the GPIO lines."""
     try:
         yield
     except OSError as e:

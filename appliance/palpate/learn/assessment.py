@@ -28,7 +28,7 @@ label."""
 CURVE = 4
 """Number of further sweeps whose effect is estimated."""
 MORE = 3
-"""Number of further sweeps that an advice names."""
+"""Number of further sweeps that an advice asks for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ class Assessment:
         return f"{few}: {MORE} more of each, of {fewest} first"
 
     def worst(self) -> int | None:
-        """The material with most errors among those that have sweeps, None without an error."""
+        """The material with sweeps that has most errors, None without an error."""
         wrong = self._counts()
         np.fill_diagonal(wrong, 0)
         errors = np.where(self._sweeps() > 0, wrong.sum(axis=0) + wrong.sum(axis=1), 0)

@@ -89,9 +89,9 @@ def taught(
     forgotten: tuple[str, ...] = (),
     displays: Mapping[str, str] = MappingProxyType({}),
 ) -> Enrolment:
-    """The bundle with these materials. One that was enrolled before is learnt anew, and a forgotten
-    one is left out. displays: names for people, by label. Raises BundleError and FormatError as
-    `enrolment.enrol`."""
+    """The bundle with these materials. A material enrolled before is learnt anew, and a forgotten
+    material is left out. displays: names for people, by label. Raises BundleError and FormatError
+    as `enrolment.enrol`."""
     new = _without(running.bundle, {*windows, *forgotten})
     warnings, disagreements = list[str](), list[str]()
     made: Enrolment | None = None

@@ -1,5 +1,5 @@
-"""A process of its own that learns beside the loop. It prints a line of JSON for each step. Nothing
-here waits: the loop looks for news between two turns."""
+"""A process of its own that learns next to the loop. It prints a line of JSON for each step.
+Nothing here waits: the loop looks for news between two turns."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEARNS = "palpate_train.teach"
 NEEDED = ("palpate_train", "scipy", "onnx")
 """Modules of the extra palpate[teach]."""
 NICE = 19
-"""Priority of a process beside the loop: the lowest."""
+"""Priority of a process next to the loop: the lowest."""
 ENDED_S = 5.0
 """Longest wait for a killed process."""
 QUIET_S = 300.0

@@ -46,7 +46,7 @@ NOTHING, GOOD = "nothing taught yet", 8
 class TaughtLesson:
     """The lesson that a person asks for.
 
-    labels: materials to record one after another; without them the page or the robot names them.
+    labels: materials to record one after another; without them the page or the robot chooses.
     position, session: of the first sweeps. good: wanted number of sweeps of each material. by: who
     teaches. options: of the settings, for the process that makes a bundle. waits: the address of
     the page to which the service hands over, or the reason why there is none; the service runs even
@@ -73,7 +73,7 @@ class TeachingProgram:
     ) -> None:
         self.settings, self.devices, self.lesson = settings, devices, lesson
         self.base = install.base(assembly.store(settings), format)
-        if self.base:  # sweeps as long as those of its materials
+        if self.base:  # sweeps as long as the sweeps of its materials
             format = self.base.bundle.format
             materials.check_settings(settings)
         self.format, self.names, self.again = format, TypedNames(), ""
@@ -123,7 +123,7 @@ class TeachingProgram:
 
 
 class Phase:
-    """A part of the program with its box. orders: of the page, taken before those of the box."""
+    """A part of the program with its box. orders: of the page, tried before commands of the box."""
 
     box: Box
     orders: Mapping[str, CommandHandler]
@@ -185,7 +185,7 @@ class RecordingPhase(Phase):
         return lambda sweep: SlideFinding(known(sweep.frames.taxels))
 
     def _lesson(self, say: Callable[[bytes], None]) -> TeachingSession:
-        """The session beside a recording. Raises ConfigError for a label that it refuses."""
+        """The teaching session of a recording. Raises ConfigError for a label that it refuses."""
         program = self._program
         if program.base:  # it has the materials of an earlier session by now
             program.base = install.base(assembly.store(program.settings), program.format)
@@ -279,7 +279,7 @@ def _forbidden(_: str) -> list[object]:
 
 
 FILE = "untaught"
-"""In the folder of the status file; the unit names it."""
+"""In the folder of the status file; palpate-teach.path watches it."""
 AFTER_NS = 20_000_000_000
 """Time until then. An installation or a delivery waits up to 10 s to see the service run; its end
 for the sake of the page would look like a failure."""

@@ -1,7 +1,7 @@
 """A session in which a person or a robot teaches the box: records sweeps, assesses them after each,
 and makes a bundle of them on demand.
 
-The work is done by processes beside the loop (process.py). A failure leaves the sweeps and the
+Processes next to the loop do the work (process.py). A failure leaves the sweeps and the
 bundle in service as they are.
 """
 
@@ -55,11 +55,10 @@ def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
 class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
-    learn: makes the command of USE. say: called with TCH
-    sentences. codes: number of codes of
-    the class bits, 0 without class bits. base: labels of the delivered bundle into which new
-    materials are taught, () without one. trained: those of them that it was trained on. It must
-    come after `recording` among the observers.
+    learn: makes the command of USE. say: called with TCH sentences. codes: number of codes of the
+    class bits, 0 without class bits. base: labels of the delivered bundle into which new materials
+    are taught, () without one. trained: the labels that it was trained on. It must come after
+    `recording` among the observers.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class TeachingSession(Observer):
         moves: dict[str, CommandHandler]
         moves = {name: partial(self._move, name) for name in ("MOVE", "RENAME", "UNDO")}
         self.recording_commands = {**recording.commands, "MATERIAL": self._material, **moves}
-        """Those of the recording, which here refuse what TEACH refuses."""
+        """The commands of the recording, which here refuse what TEACH refuses."""
         self.commands: Mapping[str, CommandHandler] = {
             "TEACH": self._teach,
             "USE": self._use,
@@ -126,7 +125,7 @@ class TeachingSession(Observer):
         return dict.fromkeys(self._named, 0) | counts
 
     def taken(self, material: str) -> int:
-        """The number of its sweeps that count, those that are still being written included."""
+        """The number of its sweeps that count, also sweeps that are still being written."""
         return self.materials().get(material, 0) + self._recording.coming(material)
 
     def _taught(self) -> dict[str, int]:
@@ -148,8 +147,8 @@ class TeachingSession(Observer):
 
     def admit(self, *labels: str, renamed: str = "") -> None:
         """Raises ConfigError for a material that the delivered bundle was trained on, and if the
-        class bits cannot hold these materials beside those of before, without the renamed one. A
-        box without class bits admits any number."""
+        class bits cannot hold these materials with the earlier materials, without the renamed one.
+        A box without class bits admits any number."""
         refuse_trained(self._trained, labels)
         if self._codes:
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
@@ -358,6 +357,6 @@ class Teacher(Observer):
         log.info(f"teach: now {label}: {wanted - self._session.taken(label)} sweeps")
 
     def _lacks(self, labels: Iterable[str]) -> list[str]:
-        """Those of the labels that want more sweeps; not one that was forgotten, or renamed."""
+        """The labels that want more sweeps, without forgotten and renamed labels."""
         named, taken = self._session.materials(), self._session.taken
         return [one for one in labels if one in named and taken(one) < self._wanted[one]]

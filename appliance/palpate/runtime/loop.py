@@ -359,7 +359,7 @@ class Box:
             if command.error:
                 raise ApplianceError(command.error)
             return future_of(self.obey(command))
-        except Exception as e:  # also one that nobody expected: the robot waits for an answer
+        except Exception as e:  # also an unexpected error: the robot waits for an answer
             reply: Future[list[object]] = Future()
             reply.set_exception(e)
             return reply

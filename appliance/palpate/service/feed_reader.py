@@ -128,8 +128,8 @@ class Reader:
         return bool(self._queue or self._lost)
 
     def put(self, line: bytes) -> None:
-        """Queue a line. Where there is no room, the oldest lines are dropped, except one that was
-        sent in part."""
+        """Queue a line. Where there is no room, the oldest lines are dropped, except a line that
+        was sent in part."""
         self._queue.append(line)
         self._size += len(line) + LINE_BYTES
         first = 1 if self._begun else 0

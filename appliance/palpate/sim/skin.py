@@ -79,7 +79,7 @@ class World:
     EFFECTS to omit.
 
     A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were
-    fitted as described in docs/decisions/0002 and 0010. Raises ConfigError if `off` names an
+    fitted as described in docs/decisions/0002 and 0010. Raises ConfigError if `off` has an
     unknown effect.
     """
 
@@ -106,7 +106,7 @@ class World:
     spot_spread: float = 0.24  # of height and vibration from one spot of a tube to another
     spot_octaves: float = 0.13  # spread of pitch and vibration frequency likewise
     shear: bool = False  # whether the skin feels shear, too
-    friction: float = 0.4  # shear over pressure, of all tubes: the paper names no coefficient
+    friction: float = 0.4  # shear over pressure, of all tubes: the paper gives no coefficient
 
     def __post_init__(self) -> None:
         if unknown := self.off - set(EFFECTS):

@@ -60,8 +60,8 @@ class RecordingSession(Observer):
 
     say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
     is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
-    earlier runs in the folder count. names: of materials that were typed, to which those of earlier
-    sweeps are added; sidecars keep them. Raises ConfigError if the folder cannot be used, or has
+    earlier runs in the folder count. names: of materials that were typed; names of earlier sweeps
+    are added; sidecars keep them. Raises ConfigError if the folder cannot be used, or has
     sweeps of another format.
     """
 
@@ -177,8 +177,8 @@ class RecordingSession(Observer):
             self._progress.add(labels.material, labels.position, -1)
 
     def forget(self, material: str, done: Callable[[], list[object]] = list) -> Reply:
-        """Learn no longer from the sweeps of a material so far, those that are still being written
-        included; they stay in the folder. done: called when that is on the disk; returns the fields
+        """Learn no longer from the sweeps of a material so far, also sweeps that are still being
+        written; they stay in the folder. done: called when that is on the disk; returns the fields
         of the reply. Raises ApplianceError."""
         self.refuse_while_changing()  # which may move sweeps to this material, or away
         held = [n for n, labels in self._counted.items() if labels.material == material]
@@ -204,7 +204,7 @@ class RecordingSession(Observer):
         def tried() -> Exception | None:
             try:
                 work()
-            except Exception as e:  # also one that nobody expected: somebody waits for the reply
+            except Exception as e:  # also an unexpected error: somebody waits for the reply
                 return e
             return None
 

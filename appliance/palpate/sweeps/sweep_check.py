@@ -147,7 +147,7 @@ class SlidesBefore:
         if not material:
             return SlideFinding()
         found = self._judge(one, [*own.values(), one], [*before.values(), one])
-        if len(own) + 1 == MANY and found == SlideFinding():  # the first one that can tell
+        if len(own) + 1 == MANY and found == SlideFinding():  # the first sweep that can tell
             group = [*own.values(), one]
             rest = [f"{n}" for n, slid in own.items() if self._judge(slid, group, []).why]
             if rest:

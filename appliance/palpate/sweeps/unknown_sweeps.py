@@ -14,7 +14,7 @@ from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 
 ALIKE = re.compile(r"; as sweep (\d{1,9})$")
-"""End of the detail of an answer, which names an earlier sweep of the same run."""
+"""End of an answer's detail, with the number of an earlier sweep of the same run."""
 
 
 @dataclass(frozen=True, slots=True)

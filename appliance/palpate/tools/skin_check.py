@@ -165,7 +165,7 @@ def _identity(link: SkinLink) -> str:
 
 
 def _format(link: SkinLink, found: list[SkinFormat]) -> str:
-    """Judge the format, and put one that can be used into `found`."""
+    """Judge the format, and put it into `found` if it can be used."""
     try:
         sent = packets.unpack_format(link.request(Request.FORMAT, 64))
         format = _sweep_format(sent)

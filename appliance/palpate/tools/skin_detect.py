@@ -67,7 +67,7 @@ class HeardBytes:
 
 def table(profiles: Mapping[str, SkinProfile]) -> list[str]:
     """All profiles in lines: name, format, missing features, and kind of skin. A last line
-    names the profiles that nobody has compared with a device."""
+    lists the profiles that nobody has compared with a device."""
     rows = [("profile", "format", "lacks", "skin")]
     for name, one in profiles.items():
         format = "as its board says" if one.codec == DEFAULT else described(one.format)

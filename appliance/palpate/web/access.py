@@ -86,7 +86,7 @@ class Access:
         )
 
     def is_host(self, host: str, own: str) -> bool:
-        """Whether the Host of a request names this machine. own: the local address of the
+        """Whether the Host of a request is this machine. own: the local address of the
         connection."""
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
         own = f"[{own}]" if ":" in own else own

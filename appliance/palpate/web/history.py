@@ -1,6 +1,6 @@
 """The verdicts of a shift, of today or of up to 90 days, as a page shows them: counts, a trend, and
-rows as CSV. They come from the file that `palpate bridge memory` writes; without one, from those
-that this program has seen."""
+rows as CSV. They come from the file that `palpate bridge memory` writes; without one, from
+the verdicts that this program has seen."""
 
 from __future__ import annotations
 

@@ -29,12 +29,12 @@ NOTES = ("onnx.infer", "onnx.quant.pre_process")
 """Metadata that onnxruntime's quantization writes into a model."""
 MOST_FILE = MOST_TENSOR = MOST_BYTES
 MOST_NODES, MOST_CONSTANTS = 1000, 2000
-"""Largest numbers of nodes and constants: three times those of MiniRocket, our largest graph.
-onnxruntime takes a kilobyte or two for each."""
+"""Largest numbers of nodes and constants: three times the numbers of MiniRocket, our largest
+graph. onnxruntime takes a kilobyte or two for each."""
 MOST_RANK = 8
-"""Most dimensions of a tensor; those of our models have up to five."""
+"""Most dimensions of a tensor; tensors of our models have up to five."""
 MOST_INT8 = 64
-"""Largest weight in int8. Beside unsigned values, two products of a larger one overflow 16 bits on
+"""Largest weight in int8. With unsigned values, two products of a larger one overflow 16 bits on
 an x86 with AVX2 and without VNNI, and -128 gives wrong sums on Arm (onnxruntime 1.31.1, 1.32.0)."""
 MOST_LETTERS = 400
 """Longest error text in a message; its names and lists come from the file."""

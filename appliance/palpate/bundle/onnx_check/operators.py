@@ -1,8 +1,8 @@
 """The operators that a bundle's model may use, with the inputs and settings that are allowed.
 
 They are the operators that the exporters of palpate-train write. Within these bounds the size of
-every value is the same for every sweep, and onnxruntime neither divides by zero nor reads beside an
-array: what the trial of a new bundle has shown holds for all sweeps.
+every value is the same for every sweep, and onnxruntime neither divides by zero nor reads outside
+an array: what the trial of a new bundle has shown holds for all sweeps.
 """
 
 from __future__ import annotations

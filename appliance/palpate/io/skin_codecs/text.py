@@ -52,7 +52,7 @@ _SHOWN = 40
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Numbers between separators, brackets, and the text that the profile names. A line is a frame,
+    """Numbers between separators, brackets, and the text that the profile gives. A line is a frame,
     or a row of a frame that a shorter line ends; with an index, a part with its number."""
     if profile.index:
         return _indexed(profile, rest.data + new)
