@@ -71,9 +71,9 @@ def measure(
     tare: Array,
     seed: int = 0,
 ) -> Widened | None:
-    """The widened shapes in the embedding `judge`, best one that has not seen `held_out`, and in
-    others, by the rule that `judge` finds; None if it finds none. features: of raw counts, which
-    the embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown."""
+    """The widened shapes in the embedding `judge`, best fitted without `held_out`, and in others,
+    by the rule that `judge` finds; None if it finds none. features: of raw counts, which the
+    embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown."""
     meter = fit_disturbance.DisturbanceMeter(train.format, tare, train.samples)
     given = enumerate(map(EvaluationSweeps, (train, held_out)))
     training, held = (disturbed(features, of, seed + i, meter) for i, of in given)

@@ -1,6 +1,6 @@
 """The calibration of a fit: everything that is fitted to the features of a finished trunk.
 
-It consists of the head that names the material and its temperature, a head for each early answer
+It consists of the head that gives the label and its temperature, a head for each early answer
 and the rule for these, the embedding and the limit of known materials, and the rule for displaced
 contacts. Temperatures, limits and rules are fitted to held-out sweeps, by heads that did not see
 the condition under which these were taken.
@@ -97,7 +97,7 @@ class HeldOut:
 class Calibration:
     """The calibration of a trunk.
 
-    weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
+    weight [F, K], bias [K]: the head that gives the label, divided by `temperature`.
     class_mean_temperature: of logits that the box computes from class means. steps: heads of the
     early answers, with their temperatures. limits: of known materials. displacement: for displaced
     contacts; None without copies. held: for each condition, the hardest first.
@@ -195,10 +195,10 @@ class CalibrationInputs:
     in them; then all sweeps decide the limit, because more positions make it depend less on chance.
     copied: augmented copies. faulty: bool [N], copies with FAULTS; the embedding and its limit see
     them, the heads do not. junk: features [m, F] of windows of each kind of junk, where sweeps are
-    too few to show where other things lie. plan: of the head that names the material; None for one
+    too few to show where other things lie. plan: of the head that gives the label; None for one
     discriminant of all features. weights: [N], how much each sweep counts for that head; None if
-    all count alike, as they do for the embedding. recordings: int [N], those of a material without
-    a gap in their numbers; None if they are unknown.
+    all count alike, as they do for the embedding. recordings: int [N], numbered without a gap in
+    each material; None if they are unknown.
     """
 
     prefixes: Array
@@ -258,7 +258,7 @@ class CalibrationInputs:
         )
 
     def naming_head(self, seen: Array) -> tuple[Array, Array]:
-        """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
+        """Weight [F, K] and bias [K] of the head that gives the label, fitted to the sweeps
         `seen` (bool [N]) and their copies."""
         plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
         known = self.head_data.take(seen & ~self.faulty)

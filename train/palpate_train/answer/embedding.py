@@ -1,7 +1,7 @@
 """Detection of unknown materials: an embedding of features, and the limit of its distances.
 
 The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps
-of every material scatter around its mean with covariance 1. The nearest mean names the material, as
+of every material scatter around its mean with covariance 1. The nearest mean gives the material, as
 in LDA, and a sweep far from all means is of an unknown material. The box needs only this map and
 the means.
 """
@@ -367,8 +367,8 @@ def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Arr
 
 
 JudgingPart = tuple[Array, Array, Embedding, Array]
-"""The sweeps to fit to (bool [N]), the numbers of those that judge, the embedding, and the labels
-[K] of its means."""
+"""The sweeps to fit to (bool [N]), the numbers of the sweeps that judge, the embedding, and the
+labels [K] of its means."""
 
 
 def cross_fitted(

@@ -151,7 +151,7 @@ def find_limit(sweeps: Dataset) -> ContactLimit:
 
 def _limit_above_unloaded(means: Array, unloaded: Array, counts: np.dtype[Any]) -> ContactLimit:
     """The limit from means [n, R, C] or [n, R, C, A] of sweeps, and mean and deviation of the
-    unloaded skin beside them, [n, 2, R, C] or [n, 2, R, C, A].
+    unloaded skin for each, [n, 2, R, C] or [n, 2, R, C, A].
 
     The box starts from one tare for all recordings. The limit is therefore above the drift between
     recordings, too.
@@ -197,7 +197,7 @@ def _limit_of_raw_counts(means: Array) -> ContactLimit:
 
 def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
     """The centre of contact at each position of `sweeps`, or in each recording if positions are
-    unknown; None without a limit or a contact. Loads are those of a box that was not tared.
+    unknown; None without a limit or a contact. Loads are computed as on a box that was not tared.
 
     The limit of the distance keeps tolerances.KEPT of positions whose own sweeps were left out,
     judged by their farthest sweep, as embedding.limit computes it: all of a few positions.
@@ -235,7 +235,7 @@ class AugmentedCopies:
     """Augmented copies of sweeps: features [M, F], labels [M], source [M], the number of the sweep
     of each.
 
-    The head that names the material learns from them how materials vary. The embedding does not see
+    The head that gives the label learns from them how materials vary. The embedding does not see
     them, because an unknown material would then lie among the known ones. held: bool [M], copies of
     sweeps that the trunk did not see; heads are judged by them and not fitted to them.
     """
@@ -254,13 +254,13 @@ class AugmentedCopies:
 
 @dataclass(frozen=True)
 class DisplacementFit:
-    """embedding: of embeddings z, fitted to those of augmented copies. rule: for the manifest."""
+    """embedding: of embeddings z, fitted to embeddings of copies. rule: for the manifest."""
 
     embedding: Embedding
     rule: DisplacementRule
 
     def classes(self, classes: Classes) -> Classes:
-        """`classes` of the embedding z, with those of displaced contacts."""
+        """`classes` of the embedding z, with the classes of displaced contacts."""
         of = self.embedding
         shown = DisplacedClasses(of.projection, of.means - of.offset, of.shapes)
         return replace(classes, displaced=shown)
@@ -314,8 +314,8 @@ def fit(
 
 def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
     """`manifest` with the largest displacement in copies of `train`, which are displaced as far as
-    those that the model was trained with; unchanged if it has no rule for displaced sweeps, or if
-    its taxels stand in one column, which training does not displace.
+    the copies that the model was trained with; unchanged if it has no rule for displaced sweeps,
+    or if its taxels stand in one column, which training does not displace.
 
     A skin that was put back has other gains, which shift the measured place as well. Among trained
     positions this error is `limit_mm` at most, which is added.

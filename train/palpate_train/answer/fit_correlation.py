@@ -1,4 +1,4 @@
-"""The least correlations of a slide, above those of noise that is made of the training sweeps.
+"""The least correlations of a slide, above the correlations of noise made of the training sweeps.
 
 Few sweeps say little of how slides differ, but in every scene noise has correlations around 0. So
 the limits come from it, and hold for three sweeps of a material. Found on FabricSlide, fingerSense

@@ -4,7 +4,7 @@ The limits of a noisy and of a silent taxel are learned from sound sweeps, and h
 taxels move together. The box bridges a broken taxel by its direct neighbours. It uses the loads
 instead if the true material is then more probable at the worst place. Then taxels are broken at
 their worst places, one more at a time, and the box answers the held-out sweeps. The manifest gets
-the largest number at which it names about as many as with a sound skin.
+the largest number at which it classifies about as many as with a sound skin.
 """
 
 from __future__ import annotations
@@ -247,8 +247,8 @@ class _Bench:
         return limit, figures
 
     def _near(self, right: int, wrong: int, lost: float) -> bool:
-        """Whether counts differ from those of the sound sweeps by at most the share `lost` of right
-        answers and WRONG of wrong ones."""
+        """Whether counts differ from the counts of sound sweeps by at most the share `lost` of
+        right answers and WRONG of wrong ones."""
         n, (clean, clean_wrong) = len(self._test.sweeps), self.clean
         return right >= clean - max(1, lost * n) and wrong <= clean_wrong + max(1, WRONG * n)
 

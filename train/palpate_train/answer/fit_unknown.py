@@ -47,7 +47,7 @@ ROUNDS = 3
 FEWEST_JUDGED = 8
 """Least number of judged sweeps of each material, below which the weights would follow chance."""
 TRAINED = (0.1, 0.3, 1.0, 3.0)
-"""Weights of the directions in which the trained materials differ, beside 1 for the features that
+"""Weights of the directions in which the trained materials differ, against 1 for the features that
 were not trained. Which of the two shows an unknown material depends on the skin."""
 
 

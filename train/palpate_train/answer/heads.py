@@ -6,7 +6,7 @@ are scaled to the same scatter. If there are fewer sweeps than features, the equ
 among the sweeps (Woodbury's identity): the same solution, many times as fast.
 
 Sweeps under a value of a condition that training lacks, such as a new force, scatter further than
-those of training. How the known values differ within a material shows how far: their differences
+training sweeps. How the known values differ within a material shows how far: their differences
 count as in a prediction for one more value.
 
 A plan adds the logits of a few discriminants, each of some of the features. Several discriminants
@@ -40,7 +40,7 @@ BATCH = 512
 class HeadPart:
     """One discriminant. columns: numbers of the features that it sees. copies: whether it sees
     augmented copies of the sweeps too. factor: of its logits; temperatures are in it. weight: the
-    size of its logits beside those of others."""
+    size of its logits, relative to other discriminants."""
 
     columns: tuple[int, ...]
     copies: bool
@@ -104,7 +104,7 @@ class HeadData:
         return replace(self, features=seen, of_copies=lambda: self.copied[:, columns])
 
     def beside(self, other: HeadData) -> HeadData:
-        """These features, then those of `other`, for the same sweeps and copies."""
+        """These features, then the features of `other`, for the same sweeps and copies."""
         features = np.hstack([self.features, other.features])
         of_both = lambda: np.hstack([self.copied, other.copied])  # noqa: E731
         return replace(self, features=features, of_copies=of_both)
@@ -181,7 +181,7 @@ def fit_discriminant(
 
     conditions: int [N, C], the value of each condition; how the values differ widens the scatter to
     what one more value is expected to add. weights: [N], how much each sweep counts for the means
-    and the scatter; one that counts 0 is left out. The logits of a material without a sweep are
+    and the scatter; a sweep that counts 0 is left out. The logits of a material without a sweep are
     ABSENT.
     Raises FormatError if there is only one sweep of each material, which does not show how
     materials vary.
@@ -230,8 +230,8 @@ def _centre(x: Array, member: Array, weights: Array | None) -> Array:
 
 
 def _differences(z: Array, labels: Array, conditions: Array) -> Array:
-    """Rows [M, F] whose squares, added to those of `z` [N, F], give the scatter under one more
-    value of each condition [N, C]. The means of `z` for labels [N] are 0.
+    """Rows [M, F] whose squares, added to the squares of `z` [N, F], give the scatter under one
+    more value of each condition [N, C]. The means of `z` for labels [N] are 0.
 
     The squares of the G known values of a label hold (G - 1) / G of their variance; the distance of
     one more value from their mean varies by (G + 1) / G of it. So 2 / (G - 1) of them are added.

@@ -63,7 +63,7 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
     """The frames [n, R, C] or [n, R, C, A] of a table, as recorded; their times [n] in seconds, or
     None without --time; and remarks.
 
-    Raises FormatError that names the option which decides, or the first reading that is not a
+    Raises FormatError with the option that decides, or the first reading that is not a
     number.
     """
     if plan.order == ("taxel", "frame") and table.values.ndim == 2:

@@ -38,7 +38,7 @@ UNITS = {
     for base, units in _SCALES.items()
     for unit, factor in units.items()
 }
-"""Each unit as a multiple of the one that units of its kind are compared in."""
+"""Each unit as a multiple of the unit to which units of its kind are converted."""
 SPELLED = (
     {re.sub("/", mark, unit): unit for unit in UNITS if "/" in unit for mark in ("_", "-", "p")}
     | {unit.replace("/", ""): unit for unit in ("mm/s", "um/s", "cm/s")}

@@ -1,6 +1,6 @@
 """Reads files with one recording, whatever their format: each has a module in data/files.
 
-Nothing is unpickled. An ambiguous file is refused, and the message names the option that decides.
+Nothing is unpickled. An ambiguous file is refused, and the message gives the option that decides.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reads sweep sets from an .npz, an HDF5 file or a folder of the box's recordings.
 
-palpate.core.sweep_set names the arrays and checks them, whatever file they come from. Nothing is
+palpate.core.sweep_set lists the arrays and checks them, whatever file they come from. Nothing is
 unpickled, and nothing outside the named file or folder is read.
 """
 
@@ -333,8 +333,8 @@ def _groups(kept: Sequence[RecordedSweep]) -> dict[str, Array]:
 
 
 def _slide_groups(kept: Sequence[RecordedSweep]) -> tuple[dict[str, Array], str]:
-    """The groups of SLIDE_GROUPS that every sweep has, and words for the set's source about those
-    that only some have."""
+    """The groups of SLIDE_GROUPS that every sweep has, and words for the set's source about
+    groups that only some have."""
     groups, remark = {}, ""
     for name, member in SLIDE_GROUPS.items():
         values = [getattr(one.sweep, member) for one in kept]

@@ -215,7 +215,7 @@ def load(spec: str, seed: int = 0) -> Dataset:
 
 
 def join(sets: Sequence[Dataset]) -> Dataset:
-    """Join sets that have the same format and materials. Groups are those that all sets have, and
+    """Join sets that have the same format and materials. Groups are all that the sets share, and
     `set`, the index of the set.
 
     The numbers of recordings, positions, sessions and objects are changed, because number 0 means

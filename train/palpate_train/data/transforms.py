@@ -148,7 +148,7 @@ def rank_taxels(sweeps: Dataset) -> list[int]:
 
 def log_powers(samples: Array, taxels: Array | slice = slice(None)) -> Array:
     """Log power [N, M, BANDS] of sweeps [N, T, R, C(, A)] without their means; M = R * C * A, or
-    those of them that are named."""
+    the number of `taxels`."""
     n, frames = samples.shape[:2]
     bins = np.geomspace(1, max(frames // 2 + 1, 2), BANDS + 1)
     starts = np.minimum(bins.astype(int)[:-1], frames // 2)

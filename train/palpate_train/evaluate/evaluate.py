@@ -220,7 +220,7 @@ def _count(count: dict[str, Any], ends: Sequence[float]) -> str:
 class Plan:
     """The runs of an evaluation: every method under every protocol with every seed; and the effort.
 
-    each: training sweeps of each material, drawn by the seed from those of a fold; 0 for all.
+    each: training sweeps of each material, which the seed draws from a fold; 0 for all.
     as_the_box: see FoldTask.
     """
 

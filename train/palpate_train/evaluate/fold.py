@@ -35,7 +35,7 @@ Array = NDArray[Any]
 Answer = Callable[[Array], Array]
 """Raw counts [T, R, C] -> logits [K]."""
 BOX = ("palpate.inference.classifier", "palpate.answer.unknown")
-"""Modules of the box that its answers depend on, beside the code of COUNTED."""
+"""Modules of the box that its answers depend on, besides the code of COUNTED."""
 TIMED_SWEEPS = 24
 """Number of test sweeps that are classified one by one, to measure their time and to compare their
 labels. They run in an inference session of the box, or in the method's library if the method has no

@@ -1,4 +1,4 @@
-"""Whether the mean level of the taxels names the material, and whether it still does under a
+"""Whether the mean level of the taxels shows the material, and whether it still does under a
 condition that the model has not seen.
 
 In most tactile sets each material was recorded in one go. Its level then shows the session as well
@@ -41,13 +41,13 @@ MOST_VALUES = 20
 FOLDS = 3
 UNTESTED = -1
 LEFT_OUT = "also where"
-"""Words of the warning about a level that names materials across values; one such line suffices."""
+"""Words of the warning about a level that shows materials across values; one such line suffices."""
 
 
 def warnings_of(sweeps: Dataset) -> list[str]:
-    """A warning for each group within whose values the mean level names materials far above chance,
-    and across whose values it loses most of that, and one if it names them far above chance across
-    values too. If no group can be left out, a warning if the level names materials far above
+    """A warning for each group within whose values the mean level shows materials far above chance,
+    and across whose values it loses most of that, and one if it shows them far above chance across
+    values too. If no group can be left out, a warning if the level shows materials far above
     chance.
 
     Sets that are too small for this check have no warning.
@@ -94,7 +94,7 @@ def levels_of(sweeps: Dataset) -> Dataset:
 
 
 def _alone(levels: Dataset) -> list[str]:
-    """A warning if the level names materials in a set in which no group can be left out."""
+    """A warning if the level shows materials in a set in which no group can be left out."""
     whole = np.zeros(len(levels), int)
     answers, _ = _within(levels, whole)
     tested = answers != UNTESTED
@@ -118,7 +118,7 @@ def _alone(levels: Dataset) -> list[str]:
 
 
 def _compared(levels: Dataset, name: str, parts: Sequence[InnerPart]) -> list[str]:
-    """A warning if the level names materials within values of the group `name`, and loses most of
+    """A warning if the level shows materials within values of the group `name`, and loses most of
     that across them. Answers are limited to the materials that occur in the value of a sweep, so
     that chance is the same for both."""
     values = levels.group(name)
@@ -186,7 +186,7 @@ def _answers(levels: Dataset, train: Array, test: Array, possible: Array) -> Arr
 
 
 def _chance(labels: Array, values: Array) -> float:
-    """The accuracy of a model that always names the most frequent material of the value. labels,
+    """The accuracy of a model that always gives the most frequent material of the value. labels,
     values: int [n]."""
     most = [np.bincount(labels[values == value]).max() for value in np.unique(values)]
     return float(sum(most) / len(labels))

@@ -96,7 +96,7 @@ def _on_cluster(
 def _finished(client: Any, left: set[Any]) -> Iterator[Any]:
     """The results of the futures `left` as they finish. Raises TimeoutError if no worker is left.
 
-    Nothing else may refer to the futures: a finished one that is not released runs again if its
+    Nothing else may refer to the futures: a finished future that is not released runs again if its
     worker dies.
     """
     from distributed import wait

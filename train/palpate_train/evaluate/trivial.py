@@ -1,4 +1,4 @@
-"""Trivial baselines, which stand beside every fit and evaluation: linear discriminants of the mean
+"""Trivial baselines, reported with every fit and evaluation: linear discriminants of the mean
 of each taxel, and of its spread and log powers in a few bands.
 
 A method that is not better has learnt no more than that. If means alone name the materials, the
@@ -87,7 +87,7 @@ def lines(protocol: str, means_removed: bool, found: Json) -> Iterator[str]:
 
 
 def above(result: Json) -> str:
-    """A warning if a baseline beside a result of `evaluate` classifies more sweeps correctly, else
+    """A warning if a baseline in a result of `evaluate` classifies more sweeps correctly, else
     ""."""
     window = result["window"]
     share = window["right"] / window["total"]
@@ -101,7 +101,7 @@ def above(result: Json) -> str:
 
 
 def scaled(x: Array) -> Array:
-    """Features [N, F] with mean 0 and deviation 1, without those that never change; a column of
+    """Features [N, F] with mean 0 and deviation 1, without features that never change; a column of
     zeros if none changes."""
     x = x[:, np.ptp(x, axis=0) > 0]
     if not x.shape[1]:

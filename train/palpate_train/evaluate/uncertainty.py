@@ -79,7 +79,7 @@ def reliability(confidence: Array, right: Array) -> list[Json]:
 def unknown(without: Iterable[Case], materials: Sequence[str]) -> Json:
     """Detection of a material that was left out of training, by material and as their mean.
 
-    Gives the AUROC of known test sweeps against those of the material, the share of known sweeps
+    Gives the AUROC of known test sweeps against sweeps of the material, the share of known sweeps
     below the limit found in training, and of unknown sweeps that pass as known.
     """
     found: dict[str, Json] = {}

@@ -141,8 +141,8 @@ class Case:
         )
 
     def numbered(self) -> Array:
-        """The test sweeps' labels [n], numbered like `seen_labels`. Those of the material left out
-        have no meaning."""
+        """The test sweeps' labels [n], numbered like `seen_labels`. Labels of the material left
+        out have no meaning."""
         if self.left_out == NONE_LEFT_OUT:
             return self.labels
         return _closed(self.labels, self.left_out)

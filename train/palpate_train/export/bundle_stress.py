@@ -1,5 +1,5 @@
-"""Answers of a bundle to corrupted sweeps, through the classifier of the box, as curves like those
-of robustness."""
+"""Answers of a bundle to corrupted sweeps, through the classifier of the box, as curves like the
+curves of robustness."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def decided(
 ) -> tuple[list[str], dict[str, Any]]:
     """The rules to leave out, and the figures of all that were judged or asked for, by name.
 
-    judge: a bundle with all rules, best one that has not seen `held_out`.
+    judge: a bundle with all rules, best fitted without `held_out`.
     """
     figures: dict[str, Any] = {
         name: {"kept": name in asked.kept, "because": "asked"}

@@ -44,7 +44,7 @@ class Answers:
     def figures(self, labels: Array, recordings: Array, protocol: str) -> dict[str, Any]:
         """Accuracy by sweep, and by recording if a recording has several sweeps; labels,
         recordings: int [N] of the sweeps. A refused, unknown or unsure sweep does not count as
-        right. Beside it the accuracy of the network alone."""
+        right. Also the accuracy of the network alone."""
         became = outcomes(self.labels, self.ok, labels)
         counts = {name: int(of.sum()) for name, of in became.items()}
         right = counts.pop("right")

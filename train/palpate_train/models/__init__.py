@@ -1,1 +1,1 @@
-"""Every method that names a material, behind one interface."""
+"""Every method that classifies sweeps, behind one interface."""

@@ -73,8 +73,8 @@ FULL_EFFORT = Effort()
 
 
 class Model(Protocol):
-    """A trained method. K: number of materials of the training set, including those that did not
-    occur in training.
+    """A trained method. K: number of materials of the training set, including materials that did
+    not occur in training.
 
     It may have further attributes, which evaluate.fold reads: `ran` (a description of the
     computation), `cost` (of the training) and `precisions` (the same model in other precisions, as

@@ -148,7 +148,7 @@ def zero_sum_taps(taps: Array) -> Array:
     rounding.
 
     The surplus is the sum after rounding. It is removed by rounding as many taps the other way,
-    those that are nearest to it. No tap leaves the range: a tap at the end of the range is whole,
+    the nearest taps first. No tap leaves the range: a tap at the end of the range is whole,
     so it was not rounded, and there are enough others.
     """
     taps = taps - taps.mean(axis=2, keepdims=True)

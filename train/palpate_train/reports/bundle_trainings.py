@@ -1,8 +1,8 @@
 """Figures of a report on a bundle that need trainings: the learning curve, and whether a material
 that was left out of training is noticed.
 
-The trainings use the bundle's method with its usual settings. Finished trainings are kept, as those
-of `evaluate` are.
+The trainings use the bundle's method with its usual settings. Finished trainings are kept, as by
+`evaluate`.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def _bundle(value: Any) -> list[str]:
 
 def _has_default(part: dict[str, Any]) -> bool:
     """Whether the default recipe, or the recipe of the packaged bundle, is among the methods of a
-    part; True if the part names no method."""
+    part; True if the part has no method."""
     methods = [name for key in ("method", "methods") for name in _list(part.get(key))]
     return not methods or SHIPPED in methods or PACKAGED in methods
 

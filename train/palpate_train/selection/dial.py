@@ -427,7 +427,7 @@ def bundle_costs(
 
 
 def _nearest(costs: Mapping[str, BundleCost], why_not: Mapping[str, str], budget: Budget) -> str:
-    """The reason why no size can be used; it names the size that exceeds the budget least."""
+    """The reason why no size can be used; it gives the size that exceeds the budget least."""
     if not costs:
         return "; ".join(f"{name} cannot be used here: {why}" for name, why in why_not.items())
     name = min(costs, key=lambda name: costs[name].order(budget))

@@ -1,1 +1,1 @@
-"""Teaching on the box: a fit in closed form, in a process of its own beside the loop."""
+"""Teaching on the box: a fit in closed form, in a process apart from the loop."""

@@ -1,6 +1,6 @@
 """The sweeps that a box is taught from: a folder of its recordings.
 
-A person records beside a robot, so a folder may hold sweeps that training from a desktop would
+A person records next to a robot, so a folder may hold sweeps that training from a desktop would
 refuse as a whole: without a material, of another format, damaged, or without a position that others
 have. Such sweeps are left out and counted, or completed.
 """
@@ -30,13 +30,13 @@ from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from
 from palpate_train.data.sets import Dataset
 
 NOWHERE = "not named"
-"""Position or session of a sweep without one, beside sweeps that have one."""
+"""Position or session of a sweep without one, among sweeps that have one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
     """Sweeps to learn from. names: of the file of each sweep [N], without suffix. left_out: number
-    of sweeps that are not among them, by reason. no_slides: those of them that are not slides.
+    of sweeps that are not among them, by reason. no_slides: the ones that are not slides.
     unchecked: what could not be seen of that, "" if all. strangers: raw counts [n, T, R, C] or [n,
     T, R, C, A] of sweeps over other things; None without any."""
 

@@ -1,4 +1,4 @@
-"""Our accuracy beside the best peer's: a line of a table, with the verdict in words."""
+"""Our accuracy and the best peer's: a line of a table, with the verdict in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names beside the marks of a picture, each at the first place that is free."""
+"""Names next to the marks of a picture, each at the first place that is free."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Label = tuple[float, float, str, str, bool]
 
 
 def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, float]] = ()) -> None:
-    """Write names beside their marks, the most important first. A name is written once, at the
+    """Write names next to their marks, the most important first. A name is written once, at the
     first of its marks with a free place; without one it is left out.
 
     taken: points in the plot's units where lines run. The axes have their final limits.

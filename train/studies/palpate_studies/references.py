@@ -1,4 +1,4 @@
-"""The models with random weights that `make bench` times beside the bundle."""
+"""The models with random weights that `make bench` times next to the bundle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from palpate_train.onnx_tools.quantize import quantize
 
 
 def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write the models that `make bench` times beside the bundle: fp32.onnx and
+    """Write the models that `make bench` times next to the bundle: fp32.onnx and
     paper_int8.onnx, both with random weights.
 
     The first is a trunk like that of the packaged bundle in float32, with stages and the fewest

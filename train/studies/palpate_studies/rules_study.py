@@ -71,7 +71,7 @@ def rows(bundle: Bundle, given: list[trial.Given], log: Callable[[str], None]) -
 
 def _took(bundles: list[Bundle], sweeps: Dataset) -> list[float]:
     """Processor time of an answer of each bundle, in milliseconds: the median of TURNS, which the
-    bundles take in turns after a first one that does not count."""
+    bundles take in turns after a first answer that does not count."""
     boxes = [Classifier(bundle, SystemClock(), slides=False) for bundle in bundles]
     took = np.empty((TURNS + 1, len(boxes)))
     for turn in took:

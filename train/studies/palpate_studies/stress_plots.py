@@ -80,7 +80,7 @@ def methods(curves: Mapping[str, Json]) -> str:
 
 
 def shown(curves: Mapping[str, Json]) -> list[str]:
-    """Corruptions that cost a drawn method five points, those that break ours first."""
+    """Corruptions that cost a drawn method five points; first the ones that break ours."""
     coloured = list(curves.values())[: len(LOOKS)]
     return list(dict.fromkeys(name for those in coloured for name in breaks_first(those)))
 
@@ -148,7 +148,7 @@ def _panels(
 
 
 def _frame(axes: Axes, curve: Json, bare: bool) -> None:
-    """Title, ticks and grid of one small picture. bare: without labels of shares, beside a picture
+    """Title, ticks and grid of one small picture. bare: without labels of shares, next to a picture
     that has them."""
     x, unit = curve["severities"], curve["unit"]
     axes.set_title(curve["title"], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)

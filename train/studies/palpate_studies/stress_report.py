@@ -62,7 +62,7 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
 
 
 def _with_box(curves: Json, box: Json) -> Json:
-    """The curves of methods, and those of the box's right answers if there are any."""
+    """The curves of methods, and of the box's right answers if there are any."""
     which = "the packaged bundle" if box["bundle"]["name"] == "default" else "its bundle"
     answered = {f"{which}, as the box answers": box["curves"]["correct"]} if box["curves"] else {}
     return {**curves, **answered}

@@ -99,7 +99,7 @@ def _has_end(path: Path) -> bool:
 
 def _has_all_pages(path: Path) -> bool:
     """Whether an SQLite file is as long as its header says (sqlite.org/fileformat2.html, 1.3),
-    since SQLite reads one that was cut in its last page as if zeros followed."""
+    since SQLite reads a file that was cut in its last page as if zeros followed."""
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:

@@ -37,7 +37,7 @@ def decimal_sign(
 ) -> str:
     """The decimal sign of numbered lines, "," or ".".
 
-    Raises FormatError that names the first ambiguous cell and the option that decides.
+    Raises FormatError with the first ambiguous cell and the option that decides.
     """
     text = "\n".join(line for _, line in rows)
     quoted = delimiter == ","

@@ -28,7 +28,7 @@ SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 
 
 def read(data: bytes, wanted: ReadPlan) -> Table:
-    """The frames in a text of JSON. Raises FormatError that names the line and the key."""
+    """The frames in a text of JSON. Raises FormatError with the line and the key."""
     text, notes = decoded(data)
     whole, facts = _whole(text), dict[str, str]()
     acquired: dict[str, Any] | None = None

@@ -17,7 +17,7 @@ SUFFIXES = (".parquet", ".pq", ".feather", ".arrow", ".arrows", ".ipc")
 
 def read(path: Path, wanted: ReadPlan) -> Table:
     """The columns of a file; a column of lists becomes one column for each element. Raises
-    FormatError that names the row and the column."""
+    FormatError with the row and the column."""
     return table(arrow(path))
 
 

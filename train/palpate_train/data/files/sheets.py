@@ -21,7 +21,7 @@ LEAST_FRAMES = 8
 
 def read(path: Path, wanted: ReadPlan) -> Table:
     """The sheet with frames, or the sheet `wanted.variable`; its rows are read as the lines of a
-    text. Raises FormatError that names the line."""
+    text. Raises FormatError with the line."""
     calamine = library("python_calamine", "a spreadsheet")
     book = calamine.CalamineWorkbook.from_path(str(path))
     sheets = {normal(name): name for name in book.sheet_names}

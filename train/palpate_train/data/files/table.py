@@ -52,13 +52,13 @@ class Table:
     """One recording.
 
     values: [n, ...] numbers in the file's data type, float64 from text; NaN where a cell is not a
-    number. columns: names of the columns, () if unnamed. vectors: one-dimensional arrays beside
-    the values, such as times, by name. beside: names of vectors, or with names_only of
-    arrays of frames, that were not read. texts: text
-    columns, one text for each frame, by column number from 0. faults: for each other column with a
-    cell that is not a number, a message about the first. notes: remarks. facts: texts about the
-    whole file by name, such as attributes. labels: texts for each frame by name. ends: the numbers
-    of frames before the ends of its recordings, () for one recording.
+    number. columns: names of the columns, () if unnamed. vectors: one-dimensional arrays besides
+    the values, such as times, by name. beside: names of vectors, or with names_only of arrays of
+    frames, that were not read. texts: text columns, one text for each frame, by column number
+    from 0. faults: for each other column with a cell that is not a number, a message about the
+    first. notes: remarks. facts: texts about the whole file by name, such as attributes. labels:
+    texts for each frame by name. ends: the numbers of frames before the ends of its recordings, ()
+    for one recording.
     array: the name of the array of `values`, "" for none.
     reversible: whether a program may have reversed the axes, and the file does not show it.
     """

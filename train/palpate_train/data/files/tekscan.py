@@ -34,7 +34,7 @@ def is_movie(lines: Sequence[str]) -> bool:
 def read(lines: Sequence[str], wanted: ReadPlan, notes: Sequence[str]) -> Table:
     """The frames [n, R, C] of a movie, and its times as the vector `time`, in seconds.
 
-    Rows and columns without a sensel are left out. Raises FormatError that names the line.
+    Rows and columns without a sensel are left out. Raises FormatError with the line.
     """
     start = next(i for i, line in enumerate(lines) if START.match(line))
     matches = [found for line in lines[:start] if (found := KEY.match(line.strip()))]

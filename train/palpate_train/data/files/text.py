@@ -412,7 +412,7 @@ def _heads(before: Sequence[Row], layout: Layout, asked: Sequence[str]) -> tuple
 def _row_names(
     names: tuple[str, ...], rows: Sequence[Row], layout: Layout
 ) -> tuple[tuple[str, ...], frozenset[int]]:
-    """The names of all columns, and column 0 if it names or counts the rows: R and pandas write
+    """The names of all columns, and column 0 if it labels or counts the rows: R and pandas write
     such a column, without a name."""
     if len(names) == layout.wide - 1:
         names = ("", *names)

@@ -1,4 +1,4 @@
-"""The architecture of a trunk: its trained stages, and the features beside them.
+"""The architecture of a trunk: its trained stages, and the other features.
 
 Stages are dense strided convolutions over time with the taxels as input channels; a feature is the
 logarithm of a channel's mean response.
@@ -63,7 +63,7 @@ class Architecture:
     planned: number of stages for which a trunk without stages prepares counts. spectrum: whether
     the head sees the bands of spectrum.py after all other features. pools: the features of
     the filter bank that it sees, some of bank.POOLS. distribution: whether it sees the shares of
-    distribution.py. loads: whether it sees those of loads.py. relations: number of scales of
+    distribution.py. loads: whether it sees the loads of loads.py. relations: number of scales of
     relations.py that it sees. slow: whether it sees the waves of slow.py. mains_hz: frequency of
     the mains, to whose hum stages and spectrum do not respond.
     """

@@ -240,7 +240,7 @@ def pooled(
     g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, how: Pooling
 ) -> list[str]:
     """Taxels as for `responses` -> log mean magnitudes, and shares above the thresholds, each
-    [1, 1 or PREFIXES, F]; only those that `how` has."""
+    [1, 1 or PREFIXES, F]; only the ones `how` has."""
     y, stages = responses(g, format, bank, x, step, how.int8)
     counts = np.array([shape.known_steps(format.window, how.prefixes) for shape in stages]).T
     steps, weights = max(shape.steps for shape in stages), _of_own_group(g, bank, counts)

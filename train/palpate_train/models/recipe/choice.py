@@ -227,7 +227,7 @@ Heads = tuple[HeadPart, ...]
 class Candidates:
     """The heads to choose from. copies: whether all discriminants see augmented copies at first,
     because the skin will be put back. loads: whether held-out groups can show what loads are good
-    for; the level of one session names its materials.
+    for; the level of one session shows its materials.
 
     Sweeps are too few to distinguish more candidates than these.
     """
@@ -282,11 +282,11 @@ class Candidates:
         return without | ({"without copies": _without_copies} if self.copies else {})
 
     def related(self, best: Heads) -> dict[str, Heads]:
-        """The relations beside two discriminants of filters of all kinds; in a size without
+        """The relations with two discriminants of filters of all kinds; in a size without
         filters, one discriminant of relations and spectrum.
 
         Few scales and all scales each have a discriminant: few carry over to a new speed, all to
-        a new force. Beside more discriminants of filters they would have too little weight.
+        a new force. With more discriminants of filters they would have too little weight.
         """
         of = self.columns
         if not of.relations.size:
@@ -424,7 +424,7 @@ def _without(parts: Heads, columns: Array) -> Heads:
 
 
 def _copied(parts: Heads, start: ScoredPlan) -> bool:
-    """Whether `parts` see copies that those of `start` do not see."""
+    """Whether `parts` see copies that the parts of `start` do not see."""
     return parts[0].copies and not start.plan.parts[0].copies
 
 

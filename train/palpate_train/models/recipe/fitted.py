@@ -73,9 +73,9 @@ class Fit:
 
     weights: of the trunk, as graph.trunk_graph takes them; `head.weight` [K, F] and `head.bias`
     [K], fitted to the features of the float trunk, and `int8.weight` and `int8.bias`, fitted to
-    those of the int8 trunk, the temperature folded into both. architecture: only the parts that the
-    heads see. ranges: of int8; None for a float trunk alone. train, held: the training sweeps and
-    the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
+    features of the int8 trunk, the temperature folded into both. architecture: only the parts that
+    the heads see. ranges: of int8; None for a float trunk alone. train, held: the training sweeps
+    and the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
     again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
     do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
     given: inputs of the calibration, kept for export if it knows other things than materials; not
@@ -349,8 +349,8 @@ def _junk(fit: Fit) -> Mapping[str, Array]:
 
 def _augmented_copies(fit: Fit, known: HeadData | None, displaced: bool) -> AugmentedCopies:
     """Copies of the training sweeps as the heads see them, and displaced copies of the held-out
-    sweeps, whose numbers come after those of the training sweeps. Where heads see no copies, one
-    of each training sweep suffices beside displaced ones, and none without."""
+    sweeps, whose numbers follow the training sweeps. Where heads see no copies, one copy of each
+    training sweep suffices with displaced copies, and none without."""
     trunk, seed = fit.trunk(), fit.about["seed"]
 
     def seen(sweeps: Dataset, change: Augmentation, drawn: int, count: int) -> Array:

@@ -11,13 +11,13 @@ MOST_SWEEPS = 4000
 """Usual largest number of sweeps of a fit. It bounds memory and time: features of each sweep and of
 its copies are held, and candidates are fitted to them (docs/recipe.md)."""
 COPIED, FEATURES, FIXED = 4, 150_000, 0.3e9
-"""Bytes that a fit needs beside its set: COPIED times those of the used sweeps, FEATURES for each
-of them, and FIXED for the program (measured, docs/recipe.md)."""
+"""Bytes that a fit needs besides its set: COPIED times the bytes of the used sweeps, FEATURES for
+each of them, and FIXED for the program (measured, docs/recipe.md)."""
 MEMINFO, CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 def needed(sweeps: Dataset, used: int) -> float:
-    """About how many bytes a fit to `used` of these sweeps needs beside the set."""
+    """About how many bytes a fit to `used` of these sweeps needs besides the set."""
     return FIXED + float(used * (FEATURES + COPIED * sweeps.samples[0].nbytes))
 
 

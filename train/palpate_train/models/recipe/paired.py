@@ -62,8 +62,8 @@ class PairedDifference:
     def helps(self) -> bool:
         """A lower loss by more than ERRORS standard errors, no group shows the opposite, and the
         accuracy is not worse. Here the loss decides, because a level shows in margins long before
-        it shows in labels: the held-out sweeps may all be right without it, and those of a new
-        condition not."""
+        it shows in labels: the held-out sweeps may all be right without it, and sweeps of a new
+        condition wrong."""
         each = [self.saved[of] for of, _ in self.groups]
         alike = all(saved.sum() >= -_error(saved) for saved in each)
         return self._clear(self.saved) and alike and not self.worse

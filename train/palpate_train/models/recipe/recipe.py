@@ -6,7 +6,7 @@
     candidates:         sums of discriminants, each of some of the features
        |   judged:      by groups that their heads did not see; then fewer filters
        v
-    stages:             trained convolutions beside them, if there are many sweeps of
+    stages:             trained convolutions as well, if there are many sweeps of
        |                each material, too many of the held-out ones get a
        |                wrong label, and stages do not make that worse
        v
@@ -314,9 +314,9 @@ def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
 def with_stages(
     judged: HeadChoice, fixed: FixedFeatures, setup: Setup
 ) -> tuple[Trunk | None, HeadChoice]:
-    """Step 4: trained stages and the heads beside them; None and `judged` if these are better.
+    """Step 4: trained stages and the heads with them; None and `judged` if these are better.
 
-    If the skin will be reattached, or if there is nothing but the spectrum beside stages, each
+    If the skin will be reattached, or if there is nothing but the spectrum besides stages, each
     stage and the spectrum suffice, unless held-out sweeps and their copies show that more is
     better: a displaced contact changes the responses of filters more, and a spectrum alone is too
     weak. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps

@@ -22,7 +22,7 @@ from palpate_train.onnx_tools.graph_builder import FLOAT, GraphBuilder
 
 Array = NDArray[np.int64]
 LAGS = (1, 2, 4, 8, 16, 32)
-"""Frames over which differences are taken, beside the signal itself."""
+"""Frames over which differences are taken, besides the signal itself."""
 SHORT = 3
 """Number of the shortest scales: the signal and its differences over one and two frames. These few
 carry over best to a new speed, all scales to a new force or direction."""

@@ -2,7 +2,7 @@
 bands of its tenths.
 
 A filter spans a part of the window, and the spectrum averages taxels. A wave as long as the window,
-or one that only some taxels of a large skin feel, is in neither. The lines are of the whole window
+or a wave that few taxels of a large skin feel, is in neither. The lines are of the whole window
 without a taper, which would hide the slowest; the bands are of each tenth, as in spectrum.py.
 """
 

@@ -48,7 +48,7 @@ def nodes(
     prefixes: bool,
 ) -> str:
     """Raw counts [1, T, M] and the factor of each [1, 1, M], M = R * C * A -> log band powers [1,
-    rows, bands], those of the first axis first.
+    rows, bands], the bands of the first axis first.
 
     There is one row for the whole window; with `prefixes` one row for each prefix.
     """
@@ -124,8 +124,8 @@ def wave_nodes(g: GraphBuilder, length: int, mains: float, end: int) -> str:
 
 
 def _averaging_nodes(g: GraphBuilder, edges: Array) -> str:
-    """Nodes that compute the matrix that averages squares over each band; folded like those of
-    `wave_nodes`."""
+    """Nodes that compute the matrix that averages squares over each band; folded like the
+    nodes of `wave_nodes`."""
     k = g("Range", 2, int(edges[-1]), 1)
     k = g("Unsqueeze", g("Concat", k, k, axis=0), [1])
     below, beyond = (g("Less", k, side) for side in (edges[:-1], edges[1:]))

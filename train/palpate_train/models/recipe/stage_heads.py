@@ -14,7 +14,7 @@ from palpate_train.models.recipe.choice import FeatureColumns
 
 Array = NDArray[Any]
 STAGES_WEIGHT = 0.5
-"""Weight of the discriminant of stages beside others; docs/decisions/0004 compares others."""
+"""Weight of the discriminant of stages among others; docs/decisions/0004 compares others."""
 
 
 def beside(plan: HeadPlan) -> list[HeadPart]:
@@ -38,8 +38,8 @@ def fixed_columns(columns: FeatureColumns, plan: HeadPlan) -> Array:
 
 
 def alone(fixed: Array) -> list[HeadPart]:
-    """A discriminant of each stage and the features `fixed`, which come after those of stages; all
-    see copies."""
+    """A discriminant of each stage and the features `fixed`, which follow the features of stages;
+    all see copies."""
     ends = np.cumsum(STAGES.channels).tolist()
     spectrum = (ends[-1] + fixed).tolist()
     return [

@@ -70,7 +70,7 @@ class ZeroSum(nn.Conv1d):
 
 
 def limit_noise(x: Tensor) -> Tensor:
-    """Taxels [B, R * C, T] with attenuation of those that are much noisier than others; see
+    """Taxels [B, R * C, T] with attenuation of a taxel that is much noisier than others; see
     architectures.NoiseLimit."""
     step, rank = NOISE_LIMIT.step(x.shape[2]), NOISE_LIMIT.rank(x.shape[1])
     noise = (x[:, :, 1::step] - x[:, :, :-1:step]).abs().mean(2, keepdim=True)

@@ -105,7 +105,7 @@ def undisturbed() -> Iterator[None]:
 
 
 def fit_multirocket_hydra(x: Array, labels: Array, seed: int) -> Callable[[Array], Array]:
-    """Margins of its ridge, as Fit; for two classes scikit-learn gives only those of the second."""
+    """Margins of its ridge, as Fit; for two classes scikit-learn gives only the second's."""
     from aeon.classification.convolution_based import MultiRocketHydraClassifier
 
     it = MultiRocketHydraClassifier(random_state=seed, n_jobs=1).fit(x, labels)

@@ -1,6 +1,6 @@
 """LITE, a small network for time series with hand-crafted filters: the METHOD lite.
 
-Three convolutions of 32 filters and 40, 20 and 10 frames beside fixed detectors of rise, fall and
+Three convolutions of 32 filters and 40, 20 and 10 frames with fixed detectors of rise, fall and
 peak, then two depthwise separable ones and a mean over time (Ismail-Fawaz et al. 2023, "LITE").
 With several taxels the first layer is separable too, and each taxel has the detectors (Ismail-Fawaz
 et al. 2024, "Look Into the LITE").
@@ -155,8 +155,8 @@ class Lite(PeerNetwork):
 
 
 def _convolved(g: GraphBuilder, x: str, layer: nn.Module, steps: int) -> str:
-    """Nodes of a SameConv, or of those of `separable`, for this many steps; a batch norm is folded
-    into the convolution before it."""
+    """Nodes of a SameConv, or of a layer of `separable`, for this many steps; a batch norm is
+    folded into the convolution before it."""
     convs: list[nn.Conv1d] = []
     for one in [*layer.children()] or [layer]:
         if isinstance(one, nn.BatchNorm1d):

@@ -92,8 +92,8 @@ TACTNET2 = ImageLayers(
     channels=(32, 64, 128), strides=((5, 2), (5, 2), (5, 1)), pool=2, norm=True, dense=1024
 )
 """TactNet-II as far as it is published: three convolutions, batch norm, 1.84 M parameters (Tulbure
-and Baeuml 2018; here 1.83 M for 1500 x 4 x 4 and six classes). The kernels are those of its
-predecessor. Channels, the dense layer and strides are our choice; the strides replace most of the
+and Baeuml 2018; here 1.83 M for 1500 x 4 x 4 and six classes). The kernels are its
+predecessor's. Channels, the dense layer and strides are our choice; the strides replace most of the
 pooling, at a twentieth of the work."""
 
 

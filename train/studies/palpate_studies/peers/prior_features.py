@@ -5,7 +5,7 @@ Static features (Hoelscher et al. 2015), spectrogram (Sinapov et al. 2011), corr
 (Kaboli et al. 2015, Chathuranga et al. 2015). The papers used other sensors (BioTac,
 accelerometers, three magnetic axes), so each function says how we adapted it to a pressure skin.
 Any grid, frame rate and data type is accepted. Raw counts are [T, R, C], or [T, R, C, A] if a taxel
-has several axes: each axis is a series, and load and centre are those of the normal axis.
+has several axes: each axis is a series, and load and centre come from the normal axis.
 """
 
 from __future__ import annotations

@@ -93,8 +93,8 @@ METHODS = (
         svm,
     ),
 )
-"""Fishel and Loeb measured one property at a time, so their likelihoods are multiplied. SVMs are
-those of baselines.svm; that of Hoelscher et al. is linear."""
+"""Fishel and Loeb measured one property at a time, so their likelihoods are multiplied. SVMs come
+from baselines.svm; that of Hoelscher et al. is linear."""
 
 
 def explore(log_probabilities: Array, min_posterior: float) -> tuple[int, int]:

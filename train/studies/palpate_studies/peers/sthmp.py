@@ -10,7 +10,7 @@ length (contrast normalisation), a linear SVM.
 Our adaptation is to a skin that slides instead of a hand that closes. Texture is in time, so a
 patch has several frames as well as taxels. Its taxels are its channels, and the mean of each is
 subtracted, as for colours in their work. The grid is hardly larger than one patch, so there is one
-layer. Several axes of a taxel are columns beside each other, which a patch holds together.
+layer. Several axes of a taxel are adjacent columns, which a patch holds together.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def _codes(g: GraphBuilder, format: SweepFormat, atoms: Array, step: int, scale:
 
 
 def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
-    """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and those of the atoms,
+    """Codes [n, K] from products of n patches with K atoms, `left` [n, K], and of the atoms,
     `gram` [K, K].
 
     The atoms that a patch chooses are made orthogonal one after another (Cholesky); a direction is
@@ -226,8 +226,8 @@ def _pursuit(g: GraphBuilder, left: str, gram: Array) -> str:
 def _solved(
     g: GraphBuilder, amounts: list[str], lengths: list[str], triangle: list[list[str]]
 ) -> list[str]:
-    """The amounts of the chosen atoms themselves, by back substitution from those of orthogonal
-    directions."""
+    """The amounts of the chosen atoms themselves, by back substitution from the amounts of
+    orthogonal directions."""
     solved: dict[int, str] = {}
     for i in reversed(range(ACTIVE)):
         amount = amounts[i]
