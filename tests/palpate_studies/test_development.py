@@ -111,6 +111,15 @@ def test_the_chart_has_findings_methods_gaps_and_the_processor():
     assert "5.0 points ahead" in development_report.caption(made)
 
 
+def test_the_axis_says_what_was_timed():
+    """The whole answer of ours, or features and network alone."""
+    answered = figures()
+    alone = figures(times=times(timed("palpate", 0.1, "int8"), timed("quant", 22.0)))
+    for made, what in ((answered, "the whole answer"), (alone, "features and network")):
+        assert f"time of {what}" in development_report.front(made)
+        assert f"of {what}" in shown(made)
+
+
 def test_the_picture_of_the_readme_names_at_most_seven_methods():
     """The line of our family, what ships, and the methods that a stranger would take otherwise."""
     named = re.findall(r">([^<>]+) \d+\.\d<", (ROOT / "docs/front.svg").read_text("utf-8"))

@@ -115,6 +115,11 @@ class ChartPanel:
         return sorted((spot for spot in self.spots if not spot.lacks), key=lambda s: s.ms)
 
     @property
+    def answered(self) -> bool:
+        """Whether our models were timed as the box answers."""
+        return any(spot.alone for spot in self.spots)
+
+    @property
     def front(self) -> list[Spot]:
         """The Pareto front of all forms."""
         return _front(self.whole)

@@ -121,7 +121,8 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float], few: bool) 
     set_ticks(axes.xaxis, tens or [float(f"{ends[0]:.1g}")], "ms")
     set_ticks(axes.yaxis, round_ticks(low - room, high + room, 6), percent=True)
     shape, frames = panel.sweep.partition(" ")[0], panel.sweep.rpartition(" ")[2]
-    timed = f"← faster: time of the whole answer to {shape} taxels, {frames} frames"
+    what = "the whole answer to" if panel.answered else "features and network for"
+    timed = f"← faster: time of {what} {shape} taxels, {frames} frames"
     axes.set_xlabel(timed, color=GREY, size=SMALL, labelpad=3)
     about = f"classified correctly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")

@@ -62,6 +62,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         best_of={case: line["best"] for case, line in zip(cases, lines, strict=True)},
         shown=comparison.shown,
         means=_mean_rows(shown, names),
+        answered=any(panel.answered for panel in shown),
         precisions=list(precisions(table, shown, names)),
         **_costs(figures, table, names),
         **_words(cases, names, _missing(table, cases, names, figures["left_out"])),
