@@ -208,8 +208,8 @@ def test_every_page_is_reached_from_the_readme():
 
 
 def test_every_way_into_the_box_has_tests():
-    """Each row of docs/security.md is whole, and the files of tests that it names exist."""
-    text = (DOCS / "security.md").read_text("utf-8")
+    """Each way in of docs/security.md is whole, and the files of tests that it names exist."""
+    text = (DOCS / "security.md").read_text("utf-8").partition("## Counts")[0]
     found = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| ")][1:]
     assert len(found) > 10
     for row in found:
