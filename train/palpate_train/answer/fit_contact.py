@@ -344,7 +344,7 @@ def _shift(made: Mapping[str, Any]) -> float:
 
 
 def text(manifest: Manifest) -> str:
-    """Up to which displacement a material is named, in words; "" without a rule."""
+    """Up to which displacement a sweep is classified, in words; "" without a rule."""
     rule = manifest.displacement
     if rule is None:
         return ""

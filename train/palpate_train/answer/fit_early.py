@@ -43,8 +43,8 @@ MIN_SWEEPS = 40
 KEPT = 0.9
 """Share of known sweeps within the limit of each step. A sweep beyond it is answered later:
 before a slide's pattern was asked for, limits of 97 % let 6.1 % of the sweeps that no one can
-name through, limits of 90 % let 3.9 %, and known sweeps needed 0.30 instead of 0.25 of the window
-(docs/decisions/0005)."""
+classify through, limits of 90 % let 3.9 %, and known sweeps needed 0.30 instead of 0.25 of the
+window (docs/decisions/0005)."""
 
 
 @dataclass(frozen=True, eq=False)

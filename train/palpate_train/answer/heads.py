@@ -10,8 +10,8 @@ training sweeps. How the known values differ within a material shows how far: th
 count as in a prediction for one more value.
 
 A plan adds the logits of a few discriminants, each of some of the features. Several discriminants
-that were fitted apart name sweeps of a new condition better than a single one of all features, and
-together they are still one matrix.
+that were fitted apart classify sweeps of a new condition better than a single one of all features,
+and together they are still one matrix.
 """
 
 from __future__ import annotations

@@ -96,5 +96,5 @@ def _fault(e: OSError | MemoryError) -> str:
     if isinstance(e, MemoryError):
         cause = f": {e}" if str(e) else ""
         return f"not enough memory{cause}; use fewer sweeps (--only), or a machine with more"
-    # an error of a library may name neither file nor cause
+    # an error of a library may give neither file nor cause
     return str(e) if e.filename is None else f"{e.filename}: {e.strerror}"

@@ -79,8 +79,8 @@ class Augmentation:
     def without_faults(self) -> Augmentation:
         """The effects of another position of the skin alone, without effects of its electronics.
 
-        Noise and silent taxels make copies so much harder to name than any displaced skin is that
-        an error rate of such copies says nothing about it.
+        Noise and silent taxels make copies so much harder to classify than any displaced skin is
+        that an error rate of such copies says nothing about it.
         """
         return replace(self, noise=0.0, noisy=0.0, silent=0.0, drift=0.0, hum=0.0)
 

@@ -152,7 +152,7 @@ def _compared(levels: Dataset, name: str, parts: Sequence[InnerPart]) -> list[st
 
 def _within(levels: Dataset, values: Array) -> tuple[Array, Array]:
     """The answers [N] to sweeps after a fit to other recordings of the same value, or UNTESTED; and
-    the materials that such an answer may name, bool [N, K]. values: int [N].
+    the materials that such an answer may give, bool [N, K]. values: int [N].
 
     A material with one recording in a value is left out there, because it cannot be on both sides.
     """

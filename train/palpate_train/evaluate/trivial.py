@@ -1,7 +1,7 @@
 """Trivial baselines, reported with every fit and evaluation: linear discriminants of the mean
 of each taxel, and of its spread and log powers in a few bands.
 
-A method that is not better has learnt no more than that. If means alone name the materials, the
+A method that is not better has learnt no more than that. If means alone show the materials, the
 level of the session may do so.
 """
 

@@ -22,7 +22,7 @@ from palpate_train.metrics import bundle_score
 Array = NDArray[Any]
 Json = dict[str, Any]
 ANSWERS = ("correct", "wrong", "unsure", "unknown", "refused", "network")
-"""The outcomes of a sweep: named with status ok, or one of three ways not to be named; and whether
+"""The outcomes of a sweep: a label with status ok, or one of three ways to get none; and whether
 the network alone is right, whose most probable label counts without the checks of the box."""
 
 

@@ -36,8 +36,8 @@ class BundleClassifier:
         return [verdict for _, verdict in bundle_score.verdicts(self._box, sweeps)]
 
     def predict(self, x: Any) -> Array:
-        """A material for each sweep, or the status of a sweep that the box does not name, such as
-        "unknown" or "no-contact"; str [n]."""
+        """A material for each sweep, or the status of a sweep that the box does not classify, such
+        as "unknown" or "no-contact"; str [n]."""
         return np.array([v.label or str(v.status) for v in self.verdicts(x)])
 
     def predict_proba(self, x: Any) -> Array:

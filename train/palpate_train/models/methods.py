@@ -1,4 +1,4 @@
-"""All methods that name a material, behind one interface, by name.
+"""All methods that classify sweeps, behind one interface, by name.
 
 A model classifies many sweeps at once on the desktop. Its ONNX graph gives the same answers on the
 box.
@@ -97,7 +97,7 @@ class Model(Protocol):
 
 @dataclass(frozen=True)
 class Method:
-    """One way to name a material.
+    """One way to classify sweeps.
 
     about: one line with its source. input: "raw" or a key of palpate.answer.features.KINDS. train:
     (training sweeps, their model_inputs, seed) -> Model; the same arguments give the same model.

@@ -32,7 +32,7 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
     """Fit a model to the lesson and write its bundle to `out`, whole or not at all. about: who
     teaches and when, for the manifest.
 
-    Raises FormatError if there are too few sweeps or materials, or if chance would name them as
+    Raises FormatError if there are too few sweeps or materials, or if chance would classify them as
     well, and ExportRefused if a check of the bundle fails.
     """
     sweeps, times = lesson.sweeps, StepTimes(SHARES, tell)
@@ -57,7 +57,7 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
 
 
 def _check_useful(validation: dict[str, Any], counts: NDArray[Any], names: Sequence[str]) -> None:
-    """Raises FormatError if the most frequent material, named always, is right as often."""
+    """Raises FormatError if the most frequent material, given always, is right as often."""
     chance = counts.max() / counts.sum()
     if validation["accuracy"] <= chance:
         raise FormatError(

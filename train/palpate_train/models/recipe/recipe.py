@@ -162,8 +162,8 @@ class Setup:
     @cached_property
     def conditions(self) -> tuple[str, ...]:
         """The groups that can be left out, the hardest first: that whose sweeps the usual heads
-        name worst if they have not seen its value. Groups of two values come last: without one of
-        them, heads learn nothing of how the other varies."""
+        classify worst if they have not seen its value. Groups of two values come last: without one
+        of them, heads learn nothing of how the other varies."""
         if len(self.left_out) < 2:
             return self.left_out
         scores = self.held_out_scores
@@ -320,7 +320,7 @@ def with_stages(
     stage and the spectrum suffice, unless held-out sweeps and their copies show that more is
     better: a displaced contact changes the responses of filters more, and a spectrum alone is too
     weak. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
-    that they were not trained on are named worse than without them.
+    that they were not trained on are classified worse than without them.
     """
     log, plan = setup.part(3), judged.chosen.plan
     stages, responses = setup.stages

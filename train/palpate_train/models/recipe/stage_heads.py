@@ -21,10 +21,10 @@ def beside(plan: HeadPlan) -> list[HeadPart]:
     """`plan` with a discriminant of trained stages, whose features come before all others. It sees
     copies, as stages do.
 
-    Stages and fixed features are so different that they err on different sweeps. Together they name
-    sweeps of a new condition better than either alone, which held-out parts hardly show. Therefore
-    stages are added unless they are worse. They have less weight than others: where a force or a
-    direction is new, they are the weakest.
+    Stages and fixed features are so different that they err on different sweeps. Together they
+    classify sweeps of a new condition better than either alone, which held-out parts hardly show.
+    Therefore stages are added unless they are worse. They have less weight than others: where a
+    force or a direction is new, they are the weakest.
     """
     size = sum(STAGES.channels)
     fixed = [replace(p, columns=tuple(np.add(p.columns, size).tolist())) for p in plan.parts]
