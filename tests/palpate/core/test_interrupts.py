@@ -26,21 +26,34 @@ except BaseException as e:  # as extension modules do
 def _loading(
     module: str, argv: list[str], library: str, folder: Path, ignored: bool = False
 ) -> subprocess.Popen[str]:
-    """A process of `python -m module` that imports `library`. ignored: with SIGINT ignored."""
+    """A process of `python -m module` that imports `library`; its errors go to the file `errors`.
+    ignored: with SIGINT ignored, else as a terminal starts it, whatever this process has inherited.
+    """
+
+    def start() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
     (folder / f"{library}.py").write_text(LOADING)
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *argv],
-        env=env,
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None,
-    )
+    with (folder / "errors").open("w") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", module, *argv],
+            env=env,
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            preexec_fn=start,
+        )
     assert process.stdout
     assert process.stdout.read(len("loading")) == "loading"
     return process
+
+
+def _ended(process: subprocess.Popen[str], folder: Path) -> tuple[int, str]:
+    """The exit code of the process, and its errors."""
+    return process.wait(timeout=60), (folder / "errors").read_text()
 
 
 @pytest.mark.parametrize(
@@ -61,8 +74,8 @@ def test_ctrl_c_during_the_imports_is_one_line(program, module, argv, library, t
     """Exit code 130, although the library makes another error of an exception."""
     process = _loading(module, argv, library, tmp_path)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    code, err = _ended(process, tmp_path)
+    assert code == 130
     assert re.fullmatch(f"{program}: interrupted .*\n", err)
 
 
@@ -74,9 +87,8 @@ def test_ctrl_c_during_a_late_import_is_one_line(tmp_path):
     argv = ["import", "tables", "--pattern", "{material}.parquet", "--rate", "9", "--out", "s.npz"]
     process = _loading("palpate_train", argv, "pyarrow", tmp_path)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
     line = "palpate-train: interrupted; the same command begins anew\n"
-    assert (process.returncode, err) == (130, line)
+    assert _ended(process, tmp_path) == (130, line)
 
 
 def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path):
@@ -84,5 +96,4 @@ def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path):
     process = _loading("palpate", ["skin", "list"], "numpy", tmp_path, ignored=True)
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (-signal.SIGTERM, "")
+    assert _ended(process, tmp_path) == (-signal.SIGTERM, "")
