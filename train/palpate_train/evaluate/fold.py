@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer import features
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.storage import put
-from palpate.inference.session import session
+from palpate.inference.session import graph_input, session
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 
@@ -50,7 +49,7 @@ NOT_COUNTED = (
 )
 """Modules that methods use and that do not change the result of a fold: it stays valid when their
 code changes. Sets are fingerprinted by their data."""
-COUNTED = ("palpate_train", "palpate_studies", "palpate.answer")
+COUNTED = ("palpate_train", "palpate_studies", "palpate.answer", "palpate.inference")
 """Packages whose code may change the result of a fold. `agreement` compares the box's other code
 with the desktop's."""
 LIBRARIES = (
@@ -200,8 +199,7 @@ def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answ
     or the library of a method without a graph."""
 
     def given(counts: Array) -> Array:
-        kind = method.input
-        return (counts if kind == "raw" else features.compute(kind, counts, rate_hz))[None]
+        return graph_input(method.input, counts, rate_hz)[None]
 
     if method.library:
         return lambda counts: model.logits(given(counts))[0]
