@@ -28,16 +28,17 @@ from palpate_train.arguments.program import Add
 _DATA: Row = ("--data", "folder of real sweeps (PALPATE_DATA)",
     path("DIR", default=os.environ.get("PALPATE_DATA")))
 _METHOD = "NAME[,NAME...]"
+_SEEDS: Row = ("--seeds", "of training: 1 to N (1)", text("N", 1, type=int))
 _OPTIONS: Mapping[str, tuple[Row, ...]] = {
     "paper": (),
     "development": (
-        ("--seeds", "of training: 1 to N (1)", text("N", 1, type=int)),
+        _SEEDS,
         ("--method", "(ours, as fit trains it, and the peers)", text(_METHOD)),
         ("--times", "measure the times of the results in --out again, and keep their accuracies",
             FLAG),
     ),
     "fabrics": (("--method", "(all)", text(_METHOD, "all")),),
-    "shots": (),
+    "shots": (_SEEDS,),
     "recipe": (),
 }
 # fmt: on
