@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from palpate_studies.command import PROGRAM
+from palpate_studies.__main__ import PROGRAM
 from tests.campaigns import __main__ as campaigns
 from tests.campaigns import processors
 from tests.factories.paths import ROOT

@@ -9,7 +9,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import Classifier
-from palpate_studies import alignment, contact_table
+from palpate_studies import alignment, tables
 from tests.factories.contacts import MIDDLE
 
 
@@ -47,7 +47,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         ] == pytest.approx(12, abs=0.01)
         assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
         assert point["network"][0] >= point["accuracy"][0]
-    table = contact_table.table(figures)
+    table = tables.alignment(figures)
     starts = ("| T-HARD, a row ahead", "| not at all | ")
     assert all(map(str.startswith, table.splitlines()[4:], starts))
     assert f"| {home['unsure']} | {home['unknown']} | " in table.splitlines()[-1]

@@ -20,7 +20,7 @@ from palpate_studies import (
     method_names,
     precisions,
 )
-from palpate_studies.command import main
+from palpate_studies.__main__ import main
 from palpate_studies.development_chart import ChartPanel, Spot
 from palpate_studies.study import StudyCase, StudyRun, save
 from palpate_train.data import sets

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palpate.core.statistics import wilson
-from palpate_studies import comparison, differences
+from palpate_studies import differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():
@@ -49,4 +49,4 @@ def test_groups_of_a_mean_err_independently():
 )
 def test_a_difference_in_words(gap: tuple[float, float, float], words: str):
     """A difference is not certain if its interval contains 0. A point below is still near."""
-    assert comparison.verdict(gap) == words
+    assert differences.verdict(gap) == words

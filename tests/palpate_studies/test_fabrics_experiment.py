@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate_studies import comparison, fabrics_experiment, matrix_table
-from palpate_studies.command import main
+from palpate_studies import differences, fabrics_experiment, tables
+from palpate_studies.__main__ import main
 from palpate_studies.development_experiment import FOUR
 from palpate_studies.study import StudyRun
 from palpate_train.data.sets import Dataset
@@ -70,7 +70,7 @@ def test_methods_are_run_under_all_protocols(data: Path):
     assert Counter(len(r["materials"]) for r in first) == {7: 6, 4: 6}
     assert all(r["only"] == list(FOUR) for r in first if r["protocol"] == "leave:direction")
     assert run(data, method="palpate") == 0
-    assert "| 7 classes" in matrix_table.headline(results(data))
+    assert "| 7 classes" in tables.fabrics(results(data))
 
 
 def test_what_is_missing_is_named(
@@ -112,10 +112,10 @@ def test_few_sweeps_of_each_material_are_trained_on(data: Path, monkeypatch: pyt
         gap, low, high = row["ahead"]["static-svm"]
         assert gap == pytest.approx((ours["right"] - peer["right"]) / ours["total"], abs=1e-4)
         assert low < gap < high
-    head, line, *rows = matrix_table.shots(made, at=3).split("\n")[2:]
+    head, line, *rows = tables.shots(made, at=3).split("\n")[2:]
     assert head.count("|") == line.count("|") == rows[0].count("|") == 5
     assert [row.partition(" classes")[0] for row in rows] == ["| 7", "| 4"]
-    assert comparison.shown(made["rows"][2]["ahead"]["static-svm"]) in rows[0]
+    assert differences.shown(made["rows"][2]["ahead"]["static-svm"]) in rows[0]
     monkeypatch.setattr(fabrics_experiment, "SHOT_PEERS", ("H-svm",))
     with pytest.raises(FormatError, match="H-svm, 2 sweeps each: 40"):
         fabrics_experiment.shots(run)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_studies import recipe_page, recipe_views
+from palpate_studies import recipe_views, tables
 from palpate_studies.study import StudyCase, StudyRun
 from palpate_train.data import sets
 from palpate_train.evaluate.evaluate import Where
@@ -17,7 +17,7 @@ from palpate_train.models.recipe.bank import POOLS
 RESULTS: dict[str, Any] = {
     "views": [
         {"view": name, "features": 10 + i, "us": 20.5 + i, "bytes": 3000 + i}
-        for i, name in enumerate((*recipe_page.VIEWS, "few relations"))
+        for i, name in enumerate((*tables.VIEWS, "few relations"))
     ],
     "sets": [
         {"set": "7 fabrics", "views": ["spectrum", "stages"], "chosen": "…"},
@@ -41,7 +41,7 @@ def test_each_view_has_a_cost_of_its_own(monkeypatch: pytest.MonkeyPatch):
     short = replace(sweeps, samples=sweeps.samples[:12, :400], labels=sweeps.labels[:12], groups={})
     found = {view["view"]: view for view in recipe_views.costs(short)}
     assert turns == [list(found)]
-    assert set(recipe_page.VIEWS) | {"few relations"} == set(found)
+    assert set(tables.VIEWS) | {"few relations"} == set(found)
     assert all(view["us"] > 0 for view in found.values())
     assert found["loads"]["features"] >= 16
     assert found["filters"]["features"] * 2 == found["shares"]["features"]
@@ -66,18 +66,16 @@ def test_views_are_read_from_the_trunk_and_needed():
     """Each part of an architecture is one; the table needs the cost of each."""
     assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
     every = Architecture((4,), 8, 2, 0, True, POOLS, True, True, 3)
-    assert recipe_views.views_of(every) == list(recipe_page.VIEWS)
+    assert recipe_views.views_of(every) == list(tables.VIEWS)
     with pytest.raises(KeyError, match="stages"):
-        recipe_page.table(
-            {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
-        )
+        tables.recipe({"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []})
 
 
 def test_the_table_has_a_row_for_each_view_with_its_sets():
     """Cost, condition and sets of each view; a view that no set has says so."""
-    head, line, *rows = recipe_page.table(RESULTS).split("\n")
+    head, line, *rows = tables.recipe(RESULTS).split("\n")
     assert head.count("|") == line.count("|") == rows[0].count("|") == 7
-    assert [row.split("|")[1].strip() for row in rows] == list(recipe_page.VIEWS)
+    assert [row.split("|")[1].strip() for row in rows] == list(tables.VIEWS)
     assert "| 13, 23.5 µs, 3 KB |" in rows[3]
     assert rows[3].endswith("| all 2 |")
     assert rows[-1].endswith("| 7 fabrics |")

@@ -8,7 +8,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_studies import reports, tables
-from palpate_studies.command import main
+from palpate_studies.__main__ import main
 from palpate_studies.reports import ResultFile
 from palpate_studies.study import save
 from palpate_train.metrics import score

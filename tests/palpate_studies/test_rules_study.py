@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from palpate.bundle import bundle
-from palpate_studies import rules_study, rules_table
-from palpate_studies.command import main
+from palpate_studies import rules_study, tables
+from palpate_studies.__main__ import main
 from palpate_train.answer import rules
 from palpate_train.data import sets
 from palpate_train.export import trial
@@ -51,7 +51,7 @@ def test_what_a_rule_is_for_is_seen_without_it(few: dict[tuple[str, ...], dict])
 
 def test_the_table_has_each_row(few: dict[tuple[str, ...], dict]):
     """Its first row is that of all rules."""
-    lines = rules_table.table({"bundle": "abc", "rows": list(few.values())}).strip().splitlines()
+    lines = tables.rules({"bundle": "abc", "rows": list(few.values())}).strip().splitlines()
     rows = [line.split("|")[1].strip() for line in lines if line.startswith("|")][2:]
     assert rows[0] == "(every rule)"
     assert rows[1:] == [" and ".join(names) for names in list(few)[1:]]

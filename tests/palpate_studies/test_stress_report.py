@@ -8,7 +8,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_studies import stress_plots, stress_report
-from palpate_studies.command import main
+from palpate_studies.__main__ import main
 from palpate_studies.method_names import plain_name
 from palpate_train.reports import formatting, html
 from tests.factories import stress_data, sweep_sets

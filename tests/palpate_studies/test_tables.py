@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate_studies import bench_table, matrix_table, tables
-from palpate_studies.command import main
+from palpate_studies import tables
+from palpate_studies.__main__ import main
 from palpate_studies.study import results_file
 from palpate_train.metrics import score
 from tests.factories.paths import ROOT
@@ -101,8 +101,8 @@ def test_answers_add_up_and_older_figures_say_so_first():
     right, wrong, none = map(int, re.findall(r"\| (\d+) (?=\|)", first))
     assert right + wrong + none == committed("stress")["box"]["curves"]["correct"]["noise"]["total"]
     figures: dict[str, Any] = committed("bench") | {"bundle": score.shipped()}
-    assert bench_table.table(figures).startswith("Measured by")
-    assert "0badbead" in bench_table.table(figures | {"bundle": "0badbead"}).partition("\n")[0]
+    assert tables.bench(figures).startswith("Measured by")
+    assert "0badbead" in tables.bench(figures | {"bundle": "0badbead"}).partition("\n")[0]
 
 
 def test_each_test_says_whether_ours_is_ahead():
@@ -128,7 +128,7 @@ def test_each_test_says_whether_ours_is_ahead():
         result("minirocket", "leave:rep", 78, **seven),
         result("H-svm", "leave:speed", 50),
     ]
-    rows = matrix_table.headline(results).splitlines()[2:]
+    rows = tables.fabrics(results).splitlines()[2:]
     parts = (
         ("7 classes", "removed", "71.0 %", "MiniRocket: 78.0 %", "−7.0 [−9.8", "falls short"),
         ("2 classes", "removed", "90.0 %", "MiniRocket: 80.0 %", "+10.0 [+7.2", "ahead"),
@@ -136,5 +136,5 @@ def test_each_test_says_whether_ours_is_ahead():
     )
     for row, cells in zip(rows, parts, strict=True):
         assert all(cell in row for cell in cells), row
-    alone = matrix_table.headline([result("palpate", "leave:force", 90)])
+    alone = tables.fabrics([result("palpate", "leave:force", 90)])
     assert "| – | – |" in alone

@@ -8,19 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.core.text import printable
 from palpate.core.types import LARGEST_READING
 from palpate_train.data import sampling
 from palpate_train.data.files.table import MOST_LISTED, Table, excerpt, normal
 from palpate_train.data.import_plan import DATE, ImportPlan
 
-Array = NDArray[Any]
 RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""

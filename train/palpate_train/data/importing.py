@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.names import shown
+from palpate.core.sweep_set import Array
 from palpate.core.text import printable
 from palpate.core.types import DATA_TYPES
 from palpate_train.data import frames, labels, lerobot, number_types, raw_files, readers, sampling
@@ -30,7 +29,6 @@ from palpate_train.data.import_plan import ImportPlan
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
 
-Array = NDArray[Any]
 DISPLAY = "display name"
 """Field of a recording whose material has a display name next to the name that is sent."""
 BATCH = 4096

@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core import storage
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate_train.data.extras import library
 from palpate_train.data.lerobot import EPISODE, FRAME, INFO, TASK, TASK_INDEX, TASKS, TIME
 from palpate_train.data.sets import Dataset
 
-Array = NDArray[Any]
 VERSION = "v3.0"
 TACTILE = "observation.tactile"
 INDEX = "index"

@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 
 if TYPE_CHECKING:
     import h5py
 
-Array = NDArray[Any]
 LEAST = 256_000_000
 """Bytes of samples from which on they are written uncompressed and mapped instead of read."""
 BATCH = 16 << 20

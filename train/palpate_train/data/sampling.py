@@ -8,14 +8,12 @@ A run ends at a gap.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 
-Array = NDArray[Any]
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 GAP_FRAMES = 3.5
 """An interval longer than this many frames is a gap: three or more frames are missing. The box

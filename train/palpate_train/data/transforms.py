@@ -7,14 +7,12 @@ which always takes the middle of each sweep.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.core.sweep_set import Array
 from palpate_train.data.sets import Dataset
 
-Array = NDArray[Any]
 BANDS = 6
 """Number of bands of a taxel's spectrum, equally wide on a logarithmic scale. Taxels are ranked by
 the log powers in them."""

@@ -7,11 +7,9 @@ from inspect import signature
 from typing import Any
 
 from aeon.classification.base import BaseClassifier
-from numpy.typing import NDArray
 
+from palpate.core.sweep_set import Array
 from palpate_train.library.estimator import PalpateClassifier
-
-Array = NDArray[Any]
 
 
 class AeonPalpateClassifier(BaseClassifier):  # type: ignore[misc]  # aeon has no types

@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.core.types import Verdict
 from palpate.inference.classifier import Classifier
 from palpate_train.data.sets import Dataset
 from palpate_train.library.sweeps import as_value_errors, of_type, raw_counts
 from palpate_train.metrics import bundle_score
-
-Array = NDArray[Any]
 
 
 class BundleClassifier:

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from sklearn.base import (
     BaseEstimator,
     ClassifierMixin,
@@ -28,6 +27,7 @@ from palpate.answer.objects import softmax
 from palpate.bundle.manifest import Manifest
 from palpate.core import provenance
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.inference.session import ModelRunner
 from palpate_train.data import labels
 from palpate_train.data.run import Run
@@ -48,8 +48,6 @@ from palpate_train.models.recipe.architectures import LEAST_WINDOW
 from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.models.recipe.sizes import SIZES, UNLIMITED
 from palpate_train.onnx_tools.graph_builder import with_head
-
-Array = NDArray[Any]
 
 
 class PalpateClassifier(

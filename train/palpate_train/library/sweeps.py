@@ -8,13 +8,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.core.types import DATA_TYPES, native
 from palpate_train.models.recipe.architectures import LEAST_WINDOW
-
-Array = NDArray[Any]
 
 
 class InputError(FormatError, ValueError):

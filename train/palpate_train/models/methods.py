@@ -13,20 +13,19 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 
 from palpate.answer import features
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate_train.data.progress import spoken as spoken  # for trainings
 from palpate_train.data.run import Log as Log
 from palpate_train.data.run import no_log as no_log
 from palpate_train.data.sets import Dataset
 
-Array = NDArray[Any]
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11 of the paper and its Fig. 9."""
 SHIPPED = "palpate"

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
@@ -26,7 +25,6 @@ from palpate_train.export import bundle_stress, measure
 from palpate_train.metrics import bundle_score
 from palpate_train.metrics.score import interval
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
 NOT_NAMED = (f"({Status.UNSURE})", f"({Status.UNKNOWN})")

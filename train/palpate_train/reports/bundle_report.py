@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from palpate.core.names import MOST_LETTERS
 from palpate_train.answer import stranger_limits
@@ -30,7 +29,6 @@ from palpate_train.reports.plot_style import (
     write,
 )
 
-Array = NDArray[Any]
 Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
 """Number of labels up to which the confusion matrix can be read on a phone. With more labels there

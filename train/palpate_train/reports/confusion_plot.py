@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from palpate.core.sweep_set import Array
 from palpate_train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -22,7 +21,6 @@ from palpate_train.reports.plot_style import (
     write,
 )
 
-Array = NDArray[Any]
 FEW = 30
 """Number of sweeps below which a row says how many there are: one of three is 33 %, too."""
 LETTER = 0.58 * SMALL / 72

@@ -12,14 +12,13 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.core.errors import ApplianceError
+from palpate.core.sweep_set import Array
 from palpate.learn.assessment import CURVE, Assessment, LearningCurve
 from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import stranger_limits
@@ -32,7 +31,6 @@ from palpate_train.models.recipe.fitted import Fit
 from palpate_train.teach.lesson import Lesson
 from palpate_train.teach.taught import NAME
 
-Array = NDArray[Any]
 DRAWS, LEAST = 3, 2
 """Draws of sweeps that are left out to see what they have brought, and the fewest sweeps of a
 material that remain."""

@@ -14,17 +14,16 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.answer.contact import centre
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.metrics.score import interval, provenance
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 UNSEEN = "other positions"
 SETS = {

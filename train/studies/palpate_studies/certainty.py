@@ -12,9 +12,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
+from palpate.core.sweep_set import Array
 from palpate_train.answer.calibrate import Calibration
 from palpate_train.answer.fit_early import decide
 from palpate_train.data.sets import Dataset, digest
@@ -32,7 +32,6 @@ from palpate_train.metrics.score import interval, provenance
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_studies import TEMPLATES, comparison, development_plots, differences
+from palpate_studies import TEMPLATES, development_plots, differences
 from palpate_studies.development_chart import (
     ANSWER,
     Accuracies,
@@ -44,7 +44,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
     for case, one in cases.items():
         row = table[case]
         peers = {plain_name(n): row[n] for n in names if n not in OURS and n in row}
-        lines.append(comparison.line(plain_case(one), row[ours], peers))
+        lines.append(differences.line(plain_case(one), row[ours], peers))
     shown = panels(figures)
     pictures = {"front": front(figures)} if shown else {}
     page = html.render(
@@ -60,7 +60,7 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         table=table,
         lines=lines,
         best_of={case: line["best"] for case, line in zip(cases, lines, strict=True)},
-        shown=comparison.shown,
+        shown=differences.shown,
         means=_mean_rows(shown, names),
         answered=any(panel.answered for panel in shown),
         precisions=list(precisions(table, shown, names)),

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.provenance import processor
+from palpate.core.sweep_set import Array
 from palpate.inference.session import graph_input, session
 from palpate_studies import cost, precisions
 from palpate_studies.development_chart import ANSWER, SERIES, TACTILE
@@ -31,7 +31,6 @@ from palpate_train.metrics import score
 from palpate_train.models import methods
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method, model_inputs
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 Log = Callable[[str], None]
 Timed = tuple[Json, measure.Call | None, measure.Call]

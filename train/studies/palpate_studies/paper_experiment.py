@@ -12,9 +12,9 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
+from palpate.core.sweep_set import Array
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
 from palpate_studies.study import StudyCase, StudyRun
@@ -24,7 +24,6 @@ from palpate_train.metrics import score
 from palpate_train.models import methods
 from palpate_train.models.methods import FULL_EFFORT, Effort, Log
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_studies import TEMPLATES, comparison, differences
+from palpate_studies import TEMPLATES, differences
 from palpate_studies.paper_experiment import ATTACHMENTS, BLIND, HARD, HARD_BLIND, OWN
 from palpate_studies.paper_values import CNN, CONFUSION, FIGURES, FIVE
 from palpate_train.reports import confusion_plot, html, provenance
@@ -105,7 +105,7 @@ def _gap(ours: Row, other: Row | None) -> str:
     if other is None:
         return "–"
     one, two = (tuple(row["share"]) for row in (ours, other))
-    return comparison.shown(differences.difference(one, two))
+    return differences.shown(differences.difference(one, two))
 
 
 def _match(rows: Mapping[Key, Row]) -> dict[str, Any]:

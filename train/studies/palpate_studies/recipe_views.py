@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from palpate.core.sweep_set import Array
 from palpate.inference.session import session
 from palpate_studies.development_experiment import CASES
 from palpate_studies.study import NO_DATA, StudyRun
@@ -25,7 +25,6 @@ from palpate_train.models.recipe.recipe import FIXED, Settings
 from palpate_train.models.recipe.trunk import Trunk
 from palpate_train.onnx_tools.graph_builder import slim, with_head
 
-Array = NDArray[Any]
 Json = dict[str, Any]
 TIMED = "sim:T-REAL/level-blind:1001:2"
 """The format in which views are timed: that of the skin of the paper."""

@@ -19,10 +19,9 @@ from palpate.inference.classifier import Classifier
 from palpate_studies import (
     alignment,
     certainty,
-    contact_table,
     rules_study,
-    rules_table,
     stress,
+    tables,
 )
 from palpate_studies.study import add_out, save
 from palpate_train.arguments import options
@@ -83,7 +82,7 @@ def run_rules(args: argparse.Namespace) -> None:
     tested, moved, packaged = sets.load(STRESSED), sets.load(MOVED), bundle.load(bundle.DEFAULT)
     result = rules_study.results(packaged, tested, moved, EACH, options.Log())
     save(args.out, result)
-    print(rules_table.table(result))
+    print(tables.rules(result))
 
 
 def run_stress(args: argparse.Namespace) -> None:
@@ -171,4 +170,4 @@ def run_alignment(args: argparse.Namespace) -> None:
     progress = Progress(displacements, options.Log())
     result = alignment.measure(box, progress.begin)
     save(args.out, result)
-    print(contact_table.table(result))
+    print(tables.alignment(result))
