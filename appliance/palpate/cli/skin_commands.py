@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from palpate.cli.common import load_bundle, load_settings, local_page
 from palpate.cli.devices import open_any, open_devices
 from palpate.core import storage
-from palpate.core.clock import Clock, SystemClock
+from palpate.core.clock import SystemClock
 from palpate.core.config import Config, SkinConfig
 from palpate.core.devices import Devices
 from palpate.core.errors import BundleError, ConfigError, SensorError, SensorMismatch
@@ -25,7 +25,6 @@ from palpate.io.usb_sensor import fits
 
 if TYPE_CHECKING:
     from palpate.alignment.live import Expected
-    from palpate.io.serial_link import SerialLink
 
 CHECK_S = 10.0
 """Default of `palpate skin check --seconds`."""
@@ -59,23 +58,16 @@ def run_check(args: argparse.Namespace) -> int:
 def _check_bytes(settings: Config, profile: SkinProfile, devices: Devices, seconds: float) -> int:
     """Print the first frames of a skin with a profile next to their bytes; 1 if a byte misfits."""
     from palpate.io.serial_link import find
+    from palpate.io.serial_sensor import opener
     from palpate.tools import skin_bytes, skin_detect
 
     path = settings.skin.port or find(profile.ids, settings.skin.serial, serial_port.ports())
     log.info(f"listening at {path}: {seconds:g} s at {profile.baud} baud")
-    opened = _opener(devices.clock, wait=devices.wait)
-    ports = skin_detect.Ports(opened, devices.clock)
+    ports = skin_detect.Ports(opener(devices.clock, devices.wait), devices.clock)
     heard = ports.listen(path, profile.baud, profile, seconds)
     lines, good = skin_bytes.report(profile, heard.data)
     print(*lines, sep="\n")
     return 0 if good else 1
-
-
-def _opener(clock: Clock, **how: Any) -> Callable[[str, int], SerialLink]:
-    """Opens a port, given its path and baud rate."""
-    from palpate.io.serial_link import SerialLink
-
-    return lambda path, baud: SerialLink(path, baud, clock, **how)
 
 
 def run_list(args: argparse.Namespace) -> int:
@@ -116,6 +108,7 @@ def run_detect(args: argparse.Namespace) -> int:
 
 def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
     """Listen at each port and print the profiles that fit; the number of ports where one fits."""
+    from palpate.io.serial_sensor import opener
     from palpate.tools import skin_detect
 
     clock, fitting = SystemClock(), 0
@@ -123,7 +116,7 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
     if ports:
         names = ", ".join(port.path for port in ports)
         log.info(f"listening at {names}; some seconds at each")
-    for one in skin_detect.Ports(_opener(clock), clock).detect(ports, profiles, write=write):
+    for one in skin_detect.Ports(opener(clock), clock).detect(ports, profiles, write=write):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
         if one.proposal:
             print(one.proposal, flush=True)
@@ -134,6 +127,7 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
 def run_new(args: argparse.Namespace) -> int:
     """Write a profile for the lines of numbers at a port. Raises ConfigError for a name or a grid
     that cannot be used, and SensorMismatch for other bytes."""
+    from palpate.io.serial_sensor import opener
     from palpate.tools import skin_detect, skin_text
 
     if not skin_profile.NAME.fullmatch(args.name):
@@ -147,7 +141,7 @@ def run_new(args: argparse.Namespace) -> int:
     log.info(f"listening at {port}")
     grid = (wire.rows, wire.cols) if args.grid else None
     bauds = (args.baud,) if args.baud else skin_detect.BAUDS
-    text, sample = skin_detect.Ports(_opener(clock), clock).propose(port, {}, grid, bauds)
+    text, sample = skin_detect.Ports(opener(clock), clock).propose(port, {}, grid, bauds)
     if not text:
         line = skin_text.odd_line(sample.data)
         what = repr(line) if line else f"{len(sample.data)} bytes, and no text"

@@ -18,9 +18,9 @@ from typing import Annotated, Any, Literal, get_type_hints
 from palpate.core import settings_files
 from palpate.core.errors import ConfigError
 from palpate.core.runtime_folder import FEED, RUNTIME, STATUS
-from palpate.core.schema import Key, Within, custom, fixed, gpio_line, keys, read_table
+from palpate.core.schema import Key, Within, custom, fixed, gpio_line, keys, read_table, unknown
 from palpate.core.settings_files import SITE
-from palpate.core.text import closest, shown
+from palpate.core.text import shown
 
 UNIT = re.compile(r"[a-z][a-z0-9-]{0,7}", re.ASCII)
 """Name of a unit (palpate@NAME); longer ones would leave no room for the label in a sentence."""
@@ -375,25 +375,12 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
                 raise ConfigError(
                     f"{where}: board is chosen elsewhere; set it in {SITE}, or give --board"
                 )
-            raise _unknown(section, [*_SECTIONS, "board"], where)
+            raise unknown(section, [*_SECTIONS, "board"], where, _KEYS)
         if not isinstance(content, dict):
             given = f"{where}: {section} = {shown(content)}"
             raise ConfigError(f"{given} is not a section; write [{section}], its keys below")
         named = {f"{section}.{last}": value for last, value in content.items()}
-        yield from read_table(
-            _KEYS,
-            named,
-            unknown=lambda name: _unknown(name, [*_KEYS], where),
-            refused=lambda why: ConfigError(f"{where}: {why}"),
-        ).items()
-
-
-def _unknown(name: str, known: list[str], where: str) -> ConfigError:
-    """The error for an unknown name, with the same key of another section or a close name."""
-    last = name.rpartition(".")[2]
-    near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
-    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-    return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")
+        yield from read_table(_KEYS, named, where).items()
 
 
 def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:

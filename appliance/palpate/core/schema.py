@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, partial
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from palpate.core.errors import BundleError
-from palpate.core.text import shown
+from palpate.core.errors import BundleError, ConfigError
+from palpate.core.text import closest, shown
 
 _Kind = TypeVar("_Kind")
 _hints: Callable[[Any], dict[str, Any]] = cache(partial(get_type_hints, include_extras=True))
@@ -90,24 +90,29 @@ def keys(kind: Any) -> dict[str, Key]:
     }
 
 
-def read_table(
-    known: Mapping[str, Key],
-    table: Mapping[str, Any],
-    *,
-    unknown: Callable[[str], Exception],
-    refused: Callable[[str], Exception],
-) -> dict[str, Any]:
-    """The values of a TOML table as their fields' types, by name. unknown: makes the error for a
-    name that is not in `known`. refused: makes the error for the text "NAME = VALUE is not allowed;
-    use ..."."""
+def read_table(known: Mapping[str, Key], table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The values of a TOML table as their fields' types, by name. Raises ConfigError naming
+    `where`, the name, and for a value what is allowed."""
     values = {}
     for name, value in table.items():
         if name not in known:
-            raise unknown(name)
+            raise unknown(name, known, where, known)
         values[name] = known[name].fit(value)
         if values[name] is None:
-            raise refused(f"{name} = {shown(value)} is not allowed; use {known[name].allowed}")
+            allowed = known[name].allowed
+            raise ConfigError(f"{where}: {name} = {shown(value)} is not allowed; use {allowed}")
     return values
+
+
+def unknown(
+    name: str, known: Iterable[str], where: str, full_names: Iterable[str] = ()
+) -> ConfigError:
+    """The error for a name that is not `known`, with the same key of another section among the
+    `full_names`, or a close name."""
+    last = name.rpartition(".")[2]
+    near = [k for k in full_names if k.endswith(f".{last}")] or closest(name, known)
+    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+    return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")
 
 
 def typed(kind: type[_Kind], table: Any) -> _Kind:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from palpate.core.clock import Clock
+from palpate.core.clock import Clock, wait_readable
 from palpate.core.config import SkinConfig
 from palpate.core.errors import SensorError, SensorMismatch
 from palpate.core.types import SweepFormat, shown
@@ -100,9 +100,15 @@ def requests(profile: SkinProfile) -> list[bytes]:
     return profile.commands(profile.poll, profile.rate_hz)
 
 
-def collect_ns(profile: SkinProfile) -> int:
-    """Least time between two reads: none while a skin waits for the next request."""
-    return 0 if requests(profile) else COLLECT_NS
+def opener(
+    clock: Clock,
+    wait: Callable[[int, float], bool] = wait_readable,
+    profile: SkinProfile | None = None,
+) -> Callable[[str, int], SerialLink]:
+    """Opens a port, given its path and baud rate, and does not collect the bytes of a skin that
+    waits for the next request. wait: see `Devices`."""
+    pause_ns = 0 if profile and requests(profile) else COLLECT_NS
+    return lambda path, baud: SerialLink(path, baud, clock, wait=wait, collect_ns=pause_ns)
 
 
 class SerialSensor(LinkSensor):
@@ -119,15 +125,13 @@ class SerialSensor(LinkSensor):
         clock: Clock,
         tap: TransferObserver | None = None,
         *,
-        open_port: Callable[[str, int], BytePort] | None = None,
+        open_port: Callable[[str, int], BytePort],
         ports: Callable[[], list[PortInfo]] = serial_port.ports,
     ) -> None:
         made = partial(skin_stream.stream, profile, format)
         super().__init__(config, format, clock, made, tap)
         self._profile, self._ports = profile, ports
-        self._open_port = open_port or (
-            lambda path, baud: SerialLink(path, baud, clock, collect_ns=collect_ns(profile))
-        )
+        self._open_port = open_port
         self._on_usb = False  # the port is of USB itself, which has no speed
         self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
 

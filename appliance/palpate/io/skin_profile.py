@@ -15,7 +15,7 @@ from palpate.core.errors import ConfigError
 from palpate.core.schema import Within, custom, keys, read_table
 from palpate.core.settings_files import read_toml
 from palpate.core.text import closest, shown
-from palpate.core.types import MOST_AXES, SweepFormat
+from palpate.core.types import DATA_TYPES, MOST_AXES, SweepFormat
 from palpate.io import checksums, wire_numbers
 
 DEFAULT = "palpate"
@@ -267,7 +267,7 @@ def _of_numbers(p: SkinProfile) -> str:
     if kinds not in (1, p.values):
         return f'number = "{p.number}" has {kinds} types for {p.values} values; give one for each'
     binary = (*_BINARY, "modbus")
-    if p.codec not in binary and any(kind not in wire_numbers.KEPT for kind in p.number.split()):
+    if p.codec not in binary and any(kind not in DATA_TYPES for kind in p.number.split()):
         return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
     if p.codec == "modbus" and wire_numbers.size(p.number) not in (2, 4):
         return f'number = "{p.number}" fills no register; write number = "uint16"'
@@ -360,18 +360,10 @@ def from_json(table: Any, where: str) -> SkinProfile:
 
 
 def _made(table: dict[str, Any], where: str) -> SkinProfile:
-    def unknown(name: str) -> ConfigError:
-        near = closest(name, _KEYS)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_KEYS)}"
-        return refused(f"{name if name.isprintable() else shown(name)} is unknown; {hint}")
-
-    def refused(why: str) -> ConfigError:
-        return ConfigError(f"{where}: {why}")
-
-    values = read_table(_KEYS, table, unknown=unknown, refused=refused)
+    values = read_table(_KEYS, table, where)
     missing = next((name for name in _NEEDED if not values.get(name)), None)
     if missing:
-        raise refused(f"{missing} is missing; matrix.toml explains each key")
+        raise ConfigError(f"{where}: {missing} is missing; matrix.toml explains each key")
     try:
         return SkinProfile(**values)
     except ConfigError as e:

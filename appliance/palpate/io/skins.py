@@ -43,14 +43,9 @@ def sensor(
     if chosen.codec == "palpate":
         return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
     # boxes whose skin speaks PROTOCOL.md do without these modules
-    from palpate.io.serial_link import SerialLink
-    from palpate.io.serial_sensor import SerialSensor, collect_ns
+    from palpate.io.serial_sensor import SerialSensor, opener
 
-    def opened(path: str, baud: int) -> SerialLink:
-        return SerialLink(
-            path, baud, devices.clock, wait=devices.wait, collect_ns=collect_ns(chosen)
-        )
-
+    opened = opener(devices.clock, devices.wait, chosen)
     return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
 
 

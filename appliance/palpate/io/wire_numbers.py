@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-KEPT = ("uint8", "int16", "uint16", "float32")
-"""Types of the box's own raw counts."""
-TYPES = (*KEPT, "int8", "int24", "uint24", "int32", "uint32")
+from palpate.core.types import DATA_TYPES
+
+TYPES = (*DATA_TYPES, "int8", "int24", "uint24", "int32", "uint32")
 
 
 def known(value: Any) -> str | None:
@@ -23,7 +23,7 @@ def known(value: Any) -> str | None:
 def data_type(kind: str) -> str:
     """The data type of raw counts that takes these numbers."""
     kinds = {*kind.split()}
-    if len(kinds) == 1 and kinds <= {*KEPT}:
+    if len(kinds) == 1 and kinds <= {*DATA_TYPES}:
         return kinds.pop()
     return "int16" if kinds <= {"int8", "uint8"} else "float32"
 

@@ -102,15 +102,12 @@ def _why(profile: SkinProfile, data: bytes, at: int, found: Decoded) -> Misfit:
             f"{data[due + wrong]:02x} where {mark[wrong]:02x} of {mark.hex(' ')} is expected,"
             f" {layout.period} bytes after the last{step}",
         )
-    if layout.checksum and due <= len(data):
-        covered = data[begin + layout.covered : begin + layout.check]
-        right = layout.checksum.of(covered).to_bytes(layout.checksum.size, layout.check_order)
-        sent = data[begin + layout.check : due]
-        if (wrong := _first_difference(sent, right)) is not None:
-            return Misfit(
-                begin + layout.check + wrong,
-                f"the {profile.checksum} is {sent.hex(' ')}, {right.hex(' ')} is expected",
-            )
+    sent, right = layout.sums(data[begin:due])
+    if due <= len(data) and (wrong := _first_difference(sent, right)) is not None:
+        return Misfit(
+            begin + layout.check + wrong,
+            f"the {profile.checksum} is {sent.hex(' ')}, {right.hex(' ')} is expected",
+        )
     return Misfit(begin, found.misfit or "the beginning of a frame is ambiguous here")
 
 

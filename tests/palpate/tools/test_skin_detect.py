@@ -217,8 +217,8 @@ def test_other_speeds_are_tried_until_one_gives_text(baud):
 def test_a_profile_is_written(capsys, tmp_path, monkeypatch, sent, code):
     """It loads; wrong names and grids are refused before the port is opened."""
     clock = VirtualClock()
-    opened = lambda path, baud, clock: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
-    monkeypatch.setattr("palpate.io.serial_link.SerialLink", opened)
+    opened = lambda path, baud, *_, **how: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
+    monkeypatch.setattr("palpate.io.serial_sensor.SerialLink", opened)
     monkeypatch.setattr("palpate.cli.skin_commands.SystemClock", lambda: clock)
     words = ["skin", "new", "mine", "--port", "/dev/a", "--out", str(tmp_path), "--grid"]
     assert main([*words, "4x4"]) == code

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,40 +33,39 @@ class PtsLayout:
     clock: int
     numbers: NDArray[np.int64]
     fixed: NDArray[np.int64]
-    seen: NDArray[np.uint8]
+    seen: bytes
 
-    def run(self, contents: NDArray[np.uint8]) -> int:
-        """How many of `contents` [n, bytes], from the first on, have this layout."""
-        if contents.shape[1] != self.size:
-            return 0
-        same = (contents[:, self.fixed] == self.seen).all(axis=1)
-        return len(same) if same.all() else int(same.argmin())
+    def fits(self, content: NDArray[np.uint8]) -> bool:
+        """Whether a packet's content [bytes] has this layout."""
+        return len(content) == self.size and content.take(self.fixed).tobytes() == self.seen
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Packets between head and tail with a sum of their bytes; a tail may occur inside."""
     data = rest.data + new
     spans, kept = _packets(data)
-    size = 4 * profile.rows * profile.cols * profile.values
-    numbers, clocks = [np.empty((0, size), np.uint8)], [np.empty((0, _CLOCK.itemsize), np.uint8)]
-    taken: list[Span] = []
+    size = 4 * profile.numbers
+    numbers, clocks, taken = [np.empty(0, np.uint8)], [np.empty(0, np.uint8)], list[Span]()
     wrong = ""
     layout: PtsLayout | None = rest.layout
-    for one, contents, where in _alike(data, spans, layout):
-        layout = one
-        if len(layout.numbers) == size:
-            numbers.append(contents[:, layout.numbers])
-            clocks.append(contents[:, layout.clock : layout.clock + _CLOCK.itemsize])
-            taken += where
-        else:
+    for start, end in spans:
+        length = end - len(_TAIL) - 2 - start - len(_HEAD)
+        content = np.frombuffer(data, np.uint8, length, start + len(_HEAD))
+        if not (layout and layout.fits(content)):
+            layout = _layout(content.tobytes())
+        if layout and len(layout.numbers) == size:
+            numbers.append(content.take(layout.numbers))
+            clocks.append(content[layout.clock : layout.clock + _CLOCK.itemsize])
+            taken.append((start, end))
+        elif layout:
             wrong = (
                 f"it sends {len(layout.numbers) // (_PILLAR - 2)} pillars, its profile says "
                 f"{shown((profile.rows, profile.cols))}"
             )
     starts, ends = np.array(taken, np.int64).reshape(-1, 2).T
-    clock = np.concatenate(clocks).view(_CLOCK)[:, 0]
+    clock = np.concatenate(clocks).view(_CLOCK)
     return Decoded(
-        arranged(profile, np.concatenate(numbers).view("<f4")),
+        arranged(profile, np.concatenate(numbers).view("<f4").reshape(-1, profile.numbers)),
         ends,
         starts - np.append(0, ends)[:-1],
         taken[-1][1] - taken[-1][0] if taken else 0,
@@ -110,26 +108,6 @@ def _end(data: bytes, begin: int) -> int:
     return 0 if tail < 0 and len(data) - begin <= MOST_PACKET else -1
 
 
-def _alike(
-    data: bytes, spans: list[Span], layout: PtsLayout | None
-) -> Iterator[tuple[PtsLayout, NDArray[np.uint8], list[Span]]]:
-    """Groups of consecutive packets of one layout: the layout, their contents [n, bytes], and their
-    spans. Packets without a layout are left out. layout: of the packets before these, which is
-    tried first."""
-    for _, group in groupby(spans, lambda span: span[1] - span[0]):
-        where = list(group)
-        content = b"".join(data[start + len(_HEAD) : end - len(_TAIL) - 2] for start, end in where)
-        contents = np.frombuffer(content, np.uint8).reshape(len(where), -1)
-        while where:
-            n = layout.run(contents) if layout else 0
-            if not n:
-                layout = _layout(contents[0].tobytes())
-                n = layout.run(contents) if layout else 1
-            if layout:
-                yield layout, contents[:n], where[:n]
-            contents, where = contents[n:], where[n:]
-
-
 def _layout(content: bytes) -> PtsLayout | None:
     """The layout of a packet; None if its content is invalid."""
     try:
@@ -150,7 +128,7 @@ def _layout(content: bytes) -> PtsLayout | None:
     numbers = np.add.outer(np.array(pillars, np.int64), np.arange(2, _PILLAR)).ravel()
     known = np.array(fixed + more, np.int64)
     return PtsLayout(
-        len(content), blocks[1], numbers, known, np.frombuffer(content, np.uint8)[known]
+        len(content), blocks[1], numbers, known, np.frombuffer(content, np.uint8)[known].tobytes()
     )
 
 

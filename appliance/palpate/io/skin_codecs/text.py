@@ -148,19 +148,19 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
     """The numbers of a line, and its fault; None if it contains anything else, or a
     number outside the range of its type. A line with more than `most` is cut after most + 1."""
     skip = profile.skip_columns
-    line, begins = _behind(profile.prefix, line)
-    if not begins:
-        return None, ""
+    if prefix := profile.prefix.encode():
+        line = line.lstrip()
+        if not line.startswith(prefix):
+            return None, ""
+        line = line.removeprefix(prefix)
     words = line.translate(_BETWEEN[profile.decimal]).split()
     if profile.around or not all(map(_DECIMAL.fullmatch, words)):
         words, around = split(line, profile.decimal)
         if around != profile.around:
             return None, _strange(line, around, profile) if words else ""
     if skip:
-        if len(words) <= max(skip):
-            words = words[: min(skip)]
-        else:
-            words = [word for i, word in enumerate(words) if i not in _positions(skip)]
+        short = len(words) <= max(skip)
+        words = words[: min(skip)] if short else [w for i, w in enumerate(words) if i not in skip]
     words = words[: most + 1]
     if profile.number == "float32":
         numbers = np.array([as_float(word) for word in words])
@@ -175,20 +175,9 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
     return np.array([int(word) for word in words], profile.number), ""
 
 
-def _behind(prefix: str, line: bytes) -> tuple[bytes, bool]:
-    """The line behind its prefix, and whether it begins with it."""
-    bare = line.lstrip() if prefix else line
-    return bare.removeprefix(prefix.encode()), bare.startswith(prefix.encode())
-
-
 def as_float(word: bytes) -> float:
     """The value of a number in a line, NaN for a taxel that gave none."""
     return float(word) if any(48 <= one < 58 for one in word) else np.nan
-
-
-@lru_cache(4)
-def _positions(columns: tuple[int, ...]) -> frozenset[int]:
-    return frozenset(columns)
 
 
 def _unfit(word: bytes, kind: str, remedy: str) -> str:
