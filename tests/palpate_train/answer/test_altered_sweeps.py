@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from palpate_train.answer import altered_sweeps
+from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_disturbance import DisturbanceMeter
-from palpate_train.answer.fit_unknown import Embed, Space
+from palpate_train.answer.fit_unknown import Embed
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
 from tests.factories import toy_bundle
@@ -44,7 +45,7 @@ def test_copies_have_each_alteration_but_broken_taxels():
     assert set(found.disturbed) < set(found.copies)
 
 
-def space(sweeps: Dataset) -> tuple[Embed, Space]:
+def embedded(sweeps: Dataset) -> tuple[Embed, Embedding]:
     """An embedding of the loads of two corners, with the means of its materials."""
 
     def embed(samples: np.ndarray) -> np.ndarray:
@@ -52,13 +53,13 @@ def space(sweeps: Dataset) -> tuple[Embed, Space]:
 
     z = embed(sweeps.samples)
     means = np.stack([z[sweeps.labels == k].mean(axis=0) for k in range(3)])
-    return embed, Space(lambda x: x, means, np.eye(2))
+    return embed, Embedding(np.eye(2), np.eye(2), np.zeros(2), means, np.empty((3, 0, 0)))
 
 
 def test_held_out_copies_widen_shapes_and_set_the_limit():
     """Few teach nothing; a bundle without the figures says so in words."""
     train, held = windows(), windows(seed=1)
-    embed, judge = space(train)
+    embed, judge = embedded(train)
     tare = np.zeros(FORMAT.shape)
     found = altered_sweeps.measure(embed, train, held, judge, tare=tare)
     assert found is not None

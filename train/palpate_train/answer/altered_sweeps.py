@@ -24,7 +24,6 @@ from palpate_train.answer.fit_unknown import (
     Embed,
     Scatters,
     ShapeRule,
-    Space,
     choose,
 )
 from palpate_train.answer.stranger_limits import LeftOut
@@ -66,8 +65,8 @@ def measure(
     features: Embed,
     train: Dataset,
     held_out: Dataset,
-    judge: Space,
-    *others: Space,
+    judge: Embedding,
+    *others: Embedding,
     tare: Array,
     seed: int = 0,
 ) -> Widened | None:
@@ -77,16 +76,17 @@ def measure(
     meter = fit_disturbance.DisturbanceMeter(train.format, tare, train.samples)
     given = enumerate(map(EvaluationSweeps, (train, held_out)))
     training, held = (disturbed(features, of, seed + i, meter) for i, of in given)
-    held, spaces = held.seen_by(judge.embed), (judge, *others)
-    seen = [training.seen_by(space.embed) for space in spaces]
+    held, embeddings = held.seen_by(judge), (judge, *others)
+    seen = [training.seen_by(embedding) for embedding in embeddings]
     unnoticed = fit_disturbance.unnoticed(training, training)
-    scatters = [Scatters.of(unnoticed.seen_by(space.embed), space) for space in spaces]
+    scatters = [Scatters.of(unnoticed.seen_by(one), one) for one in embeddings]
     judging = fit_disturbance.unnoticed(training, held)
     rule = choose(scatters[0], judging)
     if rule is None:
         return None
     shapes = tuple(map(rule.shapes, scatters))
-    judged = fit_disturbance.Judge(held, judge.means, shapes[0].astype(np.float64), rule.limit)
+    widened = shapes[0].astype(np.float64)
+    judged = fit_disturbance.Judge(held, scatters[0].means, widened, rule.limit)
     allowed = fit_disturbance.fit(judged, *seen)
     return Widened(
         shapes,
@@ -106,7 +106,7 @@ def left_out_in_turn(
 
     def view(seen: Array, embedding: Embedding, present: Array) -> Shapes:
         training = found.training.take(seen[:trained], present).seen_by(embedding)
-        scatters = Scatters.of(training, Space.of(embedding))
+        scatters = Scatters.of(training, embedding)
 
         def shapes(of: Scatters) -> Array:
             return found.rule.shapes(of).astype(np.float64)

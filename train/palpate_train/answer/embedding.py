@@ -67,11 +67,15 @@ class Embedding:
         product[len(product) - len(rest) :] += rest
         return product.astype(np.float32)
 
-    @property
+    @cached_property
     def untrained(self) -> Array:
         """[r, b], multiplies differences of z to give differences of the features that `turn` takes
         as they are; the identity if it takes none."""
-        return untrained(self.turn if self.selected else None, len(self.offset), self.selected)
+        r = len(self.offset)
+        if not self.selected:
+            return np.eye(r)
+        view: Array = np.linalg.inv(self.turn.astype(np.float64))[:, r - self.selected :]
+        return view
 
     @property
     def beyond(self) -> Array:
@@ -117,15 +121,6 @@ class Embedding:
         means = self.means.astype(np.float64)
         logits: Array = (self(features) @ means.T - (means**2).sum(1) / 2) / temperature
         return logits
-
-
-def untrained(turn: Array | None, r: int, selected: int) -> Array:
-    """See Embedding.untrained. turn: [r, r] of an embedding with r directions; None without
-    `selected` features."""
-    if turn is None:
-        return np.eye(r)
-    view: Array = np.linalg.inv(turn.astype(np.float64))[:, r - selected :]
-    return view
 
 
 def embed(features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHING) -> Embedding:

@@ -65,7 +65,7 @@ class DisturbedSweeps:
     copies: Mapping[str, tuple[Array, Array]]
     disturbed: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
-    def seen_by(self, embed: Callable[[Array], Array]) -> DisturbedSweeps:
+    def seen_by(self, embed: Embed) -> DisturbedSweeps:
         """The same in another embedding: of each row."""
         copies = {kind: (embed(z), source) for kind, (z, source) in self.copies.items()}
         return DisturbedSweeps(embed(self.z), self.labels, copies, self.disturbed)
@@ -82,39 +82,20 @@ class DisturbedSweeps:
 
 
 @dataclass(frozen=True, eq=False)
-class Space:
-    """An embedding with class means [K, r]. untrained: [r, b], multiplies differences of embeddings
-    to give differences of the features that were not trained; of all if it is not known."""
+class Scatters:
+    """Scatter of each material in an embedding. means: [K, r]. untrained: see Embedding. own:
+    covariances [K, r, r] of its sweeps around its mean. by_kind: second moments [K, r, r] of the
+    changes by each kind of alteration."""
 
-    embed: Embed
     means: Array
     untrained: Array
-
-    @classmethod
-    def of(cls, embedding: Embedding) -> Space:
-        """The embedding of a fit."""
-        return cls(embedding, embedding.means.astype(np.float64), embedding.untrained)
-
-    def trained(self, without: int | None = None) -> Array:
-        """Orthonormal directions [r, K - 1] in which the class means differ. without: a material
-        that does not count."""
-        means = self.means if without is None else np.delete(self.means, without, axis=0)
-        return differing(means)
-
-
-@dataclass(frozen=True, eq=False)
-class Scatters:
-    """Scatter of each material in a space. own: covariances [K, r, r] of its sweeps around its
-    mean. by_kind: second moments [K, r, r] of the changes by each kind of alteration."""
-
-    space: Space
     own: Array
     by_kind: Mapping[str, Array]
 
     @classmethod
-    def of(cls, altered: DisturbedSweeps, space: Space) -> Scatters:
-        """The scatter of sweeps in this space."""
-        means = space.means
+    def of(cls, altered: DisturbedSweeps, embedding: Embedding) -> Scatters:
+        """The scatter of sweeps in this embedding."""
+        means = embedding.means.astype(np.float64)
         away = altered.z - means[altered.labels]
         own = [own_scatter(away[altered.labels == k]) for k in range(len(means))]
         kinds = {}
@@ -123,32 +104,32 @@ class Scatters:
             every = _moment(change)
             each = [_moment(change[labels == k], every) for k in range(len(means))]
             kinds[kind] = OWN * np.stack(each) + (1 - OWN) * every
-        return cls(space, np.stack(own), kinds)
+        return cls(means, embedding.untrained, np.stack(own), kinds)
 
     def shapes(self, weights: Mapping[str, float], trained: float) -> Array:
         """W [K, r, r], so that |away @ W|^2 is the squared distance of a difference `away`: that in
         the features that were not trained, and `trained` times that in the trained directions."""
         added = sum(weights[kind] * scatter for kind, scatter in self.by_kind.items())
         covariances = self.own + added / max(len(self.by_kind), 1)
-        squares = within(covariances, self.space.untrained)
-        squares += trained * within(covariances, self.space.trained())
+        squares = within(covariances, self.untrained)
+        squares += trained * within(covariances, differing(self.means))
         return shapes_of(squares)
 
     def without(self, k: int) -> Scatters:
         """The scatter of the other materials than `k`."""
-        space = replace(self.space, means=np.delete(self.space.means, k, axis=0))
+        means, own = (np.delete(of, k, axis=0) for of in (self.means, self.own))
         kinds = {kind: np.delete(of, k, axis=0) for kind, of in self.by_kind.items()}
-        return Scatters(space, np.delete(self.own, k, axis=0), kinds)
+        return Scatters(means, self.untrained, own, kinds)
 
     def weight_of_trained(self, judged: DisturbedSweeps) -> float:
         """The one of TRAINED that tells `judged` sweeps of materials that are left out in turn best
         from the others (mean AUROC)."""
         k, areas = len(self.own), []
-        away = judged.z[:, None] - self.space.means
-        untrained = shaped_distances(away, shapes_of(within(self.own, self.space.untrained)))
+        away = judged.z[:, None] - self.means
+        untrained = shaped_distances(away, shapes_of(within(self.own, self.untrained)))
         for number in np.unique(evenly(k, LEFT_OUT)):
             others, unknown = np.delete(np.arange(k), number), judged.labels == number
-            shapes = shapes_of(within(self.own[others], self.space.trained(number)))
+            shapes = shapes_of(within(self.own[others], differing(self.means[others])))
             trained = shaped_distances(away[:, others], shapes)
             near = [(untrained[:, others] + w * trained).min(axis=1) for w in TRAINED]
             areas.append([auroc(d[~unknown], d[unknown]) for d in near])
@@ -183,7 +164,7 @@ def choose(scatters: Scatters, judged: DisturbedSweeps) -> ShapeRule | None:
 
     judged: sweeps that `scatters` and the class means have not seen. None if they are too few.
     """
-    means = scatters.space.means
+    means = scatters.means
     each = np.bincount(judged.labels, minlength=len(means))
     if each.min() < FEWEST_JUDGED or not judged.copies:
         return None
@@ -238,7 +219,7 @@ class _Trial:
 
     def distances(self, z: Array, shapes: Array) -> Array:
         """Squared distances [n, K] of embeddings z [n, r]."""
-        return shaped_distances(z[:, None] - self.scatters.space.means, shapes)
+        return shaped_distances(z[:, None] - self.scatters.means, shapes)
 
     def shares(self, weights: Mapping[str, float]) -> _Shares:
         shapes, labels = self.scatters.shapes(weights, self.trained), self.judged.labels

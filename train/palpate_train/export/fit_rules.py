@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,6 @@ from palpate_train.answer.calibrate import Calibration, CalibrationInputs
 from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_early import EarlyRule
-from palpate_train.answer.fit_unknown import Space
 from palpate_train.answer.rules import RULES, Asked
 from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.export import trial
@@ -118,15 +118,10 @@ def _limits(
 def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:
     """Shapes of known materials that know how altered sweeps differ. apart: an embedding that did
     not see the held-out sweeps."""
-    trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
+    features = partial(run, fit.trunk())
     seed = int(fit.about["seed"])
     return altered_sweeps.measure(
-        lambda samples: run(trunk, samples),
-        fit.train,
-        fit.held,
-        *spaces,
-        tare=fit.tare,
-        seed=seed,
+        features, fit.train, fit.held, apart, whole, tare=fit.tare, seed=seed
     )
 
 
