@@ -199,19 +199,11 @@ class DisplacementRule:
 
     def judges(self, given: StageInputs) -> list[Stage]:
         """Whether the contact is within reach."""
-        return [] if self.farthest_mm is None else [WithinReach(self.farthest_mm)]
-
-
-class WithinReach:
-    """Refuses a contact that is displaced further than any training copy, `farthest_mm`."""
-
-    def __init__(self, farthest_mm: float) -> None:
-        self._farthest_mm = farthest_mm
+        return [self]
 
     def apply(self, context: Context) -> Refusal | None:
-        """Refuse a sweep that is too far off."""
-        if context.displacement.mm > self._farthest_mm:
-            return Refusal(
-                Status.UNKNOWN, Remark(Reason.TOO_FAR, {"farthest_mm": self._farthest_mm})
-            )
+        """Refuse a contact that is displaced further than any training copy."""
+        farthest = self.farthest_mm
+        if farthest is not None and context.displacement.mm > farthest:
+            return Refusal(Status.UNKNOWN, Remark(Reason.TOO_FAR, {"farthest_mm": farthest}))
         return None

@@ -40,7 +40,13 @@ class Correlations:
 
     def judges(self, given: StageInputs) -> list[Stage]:
         """Whether the counts move like noise."""
-        return [NotNoise(self)]
+        return [self]
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a whole window that moves like noise."""
+        if context.whole and not self.within(correlations(context.window)):
+            return Refusal(Status.NO_SLIDE, Remark(Reason.NOISE))
+        return None
 
 
 def correlations(taxels: Counts) -> tuple[float, float]:
@@ -71,16 +77,3 @@ def _repeated(part: NDArray[np.float32], time: NDArray[np.float32]) -> float:
     moving = power > TINY
     later = np.vecdot(away[:, 1:], away[:, :-1])
     return float((later[moving] / power[moving]).mean()) if moving.any() else 1.0
-
-
-class NotNoise:
-    """Refuses a whole window that moves like noise."""
-
-    def __init__(self, least: Correlations) -> None:
-        self._least = least
-
-    def apply(self, context: Context) -> Refusal | None:
-        """Refuse noise."""
-        if context.whole and not self._least.within(correlations(context.window)):
-            return Refusal(Status.NO_SLIDE, Remark(Reason.NOISE))
-        return None

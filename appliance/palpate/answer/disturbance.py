@@ -162,6 +162,14 @@ class Disturbances:
         grown = (a.slope * size for a, size in zip(self.allowances, sizes, strict=True))
         return 1 + max(grown, default=0.0)
 
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a sweep with a disturbance beyond what export has tried."""
+        untried = self.untried(context.disturbed)
+        if not untried:
+            return None
+        what = ", ".join(f"{one} than was tried with this bundle" for one in untried)
+        return Refusal(Status.UNKNOWN, Remark(Reason.UNTRIED, {"what": what}))
+
 
 class MeasureDisturbances:
     """Measures the disturbances of a sweep. unloaded: whether training knew the unloaded skin."""
@@ -180,18 +188,3 @@ class MeasureDisturbances:
             "speed": speed(context.slide.taxels_s),
             "load": load(context.mean, tare),
         }
-
-
-class WasTried:
-    """Refuses a sweep with a disturbance beyond what export has tried."""
-
-    def __init__(self, allowed: Disturbances) -> None:
-        self._allowed = allowed
-
-    def apply(self, context: Context) -> Refusal | None:
-        """Refuse an untried disturbance."""
-        untried = self._allowed.untried(context.disturbed)
-        if not untried:
-            return None
-        what = ", ".join(f"{one} than was tried with this bundle" for one in untried)
-        return Refusal(Status.UNKNOWN, Remark(Reason.UNTRIED, {"what": what}))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from palpate.answer.contact import ContactPositions, DisplacementRule, LocateContact
 from palpate.answer.correlation import Correlations
-from palpate.answer.disturbance import Disturbances, MeasureDisturbances, WasTried
+from palpate.answer.disturbance import Disturbances, MeasureDisturbances
 from palpate.answer.early import Early
 from palpate.answer.hum import HumFilter
 from palpate.answer.objects import Certain, GivesNumbers, ObjectSweeps
@@ -69,7 +69,7 @@ class Rules:
         if disturbed:
             measuring.append(MeasureDisturbances(unloaded=given.unloaded))
             if self.known:
-                measuring.append(WasTried(disturbed))
+                measuring.append(disturbed)
         given = replace(given, height=able, beyond=(disturbed or Disturbances()).beyond)
         rules = [getattr(self, field.name) for field in fields(Rules)]
         judges = [one for of in rules if hasattr(of, "judges") for one in of.judges(given)]

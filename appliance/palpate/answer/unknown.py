@@ -191,27 +191,6 @@ class EarlyDistances:
         return nearest
 
 
-class UnknownSweeps:
-    """The latest sweeps of unknown materials, to notice a material that comes again."""
-
-    def __init__(self, distances: ClassDistances) -> None:
-        self._distances = distances
-        self._sweeps: deque[tuple[int, NDArray[Any]]] = deque(maxlen=KEPT)
-
-    def put(self, sweep: int, embedding: NDArray[Any]) -> int:
-        """Keep the embedding [r] of the sweep with this number. The number of the sweep before it
-        that is most alike, 0 if none is nearly as alike as two sweeps of one material."""
-        alike = 0
-        if self._sweeps:
-            numbers, others = zip(*self._sweeps, strict=True)
-            apart = self._distances.apart(embedding, np.stack(others))
-            nearest = int(apart.argmin())
-            if apart[nearest] <= ALIKE * self._distances.loose:
-                alike = numbers[nearest]
-        self._sweeps.append((sweep, embedding))
-        return alike
-
-
 class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: of the means, [K].
     strangers: the limit of `known` that applies. loose: the loose one, for the same embedding.
@@ -344,12 +323,13 @@ class KnownMaterial:
     with the logits of the enrolled labels.
 
     displaced: for sweeps whose contact is displaced, None without a rule for them. Neither a
-    displacement nor a disturbance makes a material unknown.
+    displacement nor a disturbance makes a material unknown. The latest sweeps of unknown materials
+    are kept, to notice a material that comes again.
     """
 
     def __init__(self, means: ClassDistances, displaced: ClassDistances | None) -> None:
         self._means, self._displaced = means, displaced
-        self._unknown = UnknownSweeps(means)
+        self._unknown: deque[tuple[int, NDArray[Any]]] = deque(maxlen=KEPT)
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse an unknown material."""
@@ -361,7 +341,20 @@ class KnownMaterial:
         if novelty is None:
             return None
         # a golden sweep has no number, and nobody touched it
-        if not off and context.sweep.id and (alike := self._unknown.put(context.sweep.id, z)):
+        if not off and context.sweep.id and (alike := self._keep(context.sweep.id, z)):
             again = Remark(Reason.UNLIKE_ALL_AGAIN, novelty | {"sweep": alike})
             return Refusal(Status.UNKNOWN, again)
         return Refusal(Status.UNKNOWN, Remark(Reason.UNLIKE_ALL, novelty))
+
+    def _keep(self, sweep: int, embedding: NDArray[Any]) -> int:
+        """Keep the embedding [r] of the sweep with this number. The number of the sweep before it
+        that is most alike, 0 if none is nearly as alike as two sweeps of one material."""
+        alike = 0
+        if self._unknown:
+            numbers, others = zip(*self._unknown, strict=True)
+            apart = self._means.apart(embedding, np.stack(others))
+            nearest = int(apart.argmin())
+            if apart[nearest] <= ALIKE * self._means.loose:
+                alike = numbers[nearest]
+        self._unknown.append((sweep, embedding))
+        return alike
