@@ -21,8 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer import time_series
-from palpate.answer.time_series import FLOOR
 from palpate.core.errors import FormatError
 
 Array = NDArray[np.float64]
@@ -35,17 +33,74 @@ HOP_S, WINDOW_S = 0.05, 0.1
 """Step and length of the short windows (eq. 5)."""
 SILENT = 1e-12
 """A short window with less power than this (counts^2) is not normalised but left near zero."""
+FLOOR = 1e-6
+"""Least power of a bin, or variance, in counts^2. With it a silent skin has a logarithm and a
+centroid; real readings are larger and do not change."""
+ROUNDING = 1e-6
+"""A mean below this share of its taxel's largest count is a rounding error (float32 counts whose
+means were removed). Means of unsigned counts are this small only in windows of a million frames."""
 
 
-def taxel_weights(taxels: NDArray[Any]) -> Array:
-    """Eq. 4: each taxel's share of the activation, [M] with M = R * C * A and sum 1. taxels: raw
-    counts.
+def series_of(taxels: NDArray[Any]) -> Array:
+    """Raw counts [T, R, C] or [T, R, C, A] as one time series per taxel and axis, row by row:
+    float64 [M, T]. Raises FormatError if the array is not a sweep or not finite."""
+    if taxels.ndim not in (3, 4) or taxels.size == 0:
+        raise FormatError(
+            f"an array of shape {taxels.shape} is not a sweep; use frames x rows x columns (x "
+            "axes), "
+            "none of them 0"
+        )
+    x = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T, np.float64)
+    if not np.isfinite(x).all():
+        raise FormatError(
+            "the sweep holds counts that are not a number or infinite; check how it was recorded"
+        )
+    return x
+
+
+def check_rate(rate_hz: float) -> None:
+    """Raises FormatError if `rate_hz` is not a positive number."""
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise FormatError(f"a rate of {rate_hz} Hz is out of range; use more than 0")
+
+
+def means(x: Array) -> Array:
+    """Means over time [M] of `x` [M, T] in counts; 0 if smaller than ROUNDING."""
+    mean: Array = x.mean(axis=1)
+    mean[np.abs(mean) < ROUNDING * np.abs(x).max(axis=1)] = 0.0
+    return mean
+
+
+def taxel_weights(x: Array, axes: int = 1) -> Array:
+    """Eq. 4: each taxel's share of the activation in `x` [M, T], [M] with sum 1. Each of a taxel's
+    `axes` gets the same part of the taxel's weight, which is its share of the load along the
+    normal.
 
     A taxel with a negative mean (int16 after a tare) counts as not touched and gets weight 0, so
     that no weight is negative or grows without bound where means cancel. If no mean is positive all
-    weights are 1 / M. Raises FormatError if the array is not a sweep.
+    weights are 1 / M.
     """
-    return time_series.weights(time_series.of(taxels), axes(taxels))
+    mean = np.maximum(means(x[axes - 1 :: axes]), 0.0)
+    total = mean.sum()
+    share: Array = mean / total if total > 0 else np.full(len(mean), 1 / len(mean))
+    return share.repeat(axes) / axes
+
+
+def detrended(x: Array) -> Array:
+    """`x` [M, T] minus the least-squares line of each series."""
+    centred: Array = x - x.mean(axis=1, keepdims=True)
+    time = np.arange(x.shape[1]) - (x.shape[1] - 1) / 2
+    slope = centred @ time / max(time @ time, 1.0)
+    centred -= slope[:, None] * time
+    return centred
+
+
+def power_spectrum(x: Array, frames: int) -> Array:
+    """Eq. 1, squared: |DFT|^2 / frames along the last axis, in counts^2; bins from DC to
+    Nyquist."""
+    spectrum = np.fft.rfft(x)
+    squared: Array = (spectrum.real**2 + spectrum.imag**2) / frames
+    return squared
 
 
 def axes(taxels: NDArray[Any]) -> int:
@@ -63,11 +118,11 @@ def l_features(taxels: NDArray[Any], rate_hz: float) -> Array:
     FLOOR, so that a silent skin gives about log(M * FLOOR) and the middle of each band. One frame
     is enough. Raises FormatError if the array is not a sweep, or for an invalid rate.
     """
-    x = time_series.of(taxels)
-    time_series.check_rate(rate_hz)
+    x = series_of(taxels)
+    check_rate(rate_hz)
     frames = x.shape[1]
-    power = np.maximum(time_series.power(time_series.detrended(x), frames), FLOOR)
-    weights = time_series.weights(x, axes(taxels))
+    power = np.maximum(power_spectrum(detrended(x), frames), FLOOR)
+    weights = taxel_weights(x, axes(taxels))
     first, last = _bins(HIGH_HZ, frames, rate_hz)
     roughness = np.log(power[:, first : last + 1].sum() / max(last - first, 1))
     centroids = [_centroid(power, weights, band, frames, rate_hz) for band in (HIGH_HZ, LOW_HZ)]
@@ -99,15 +154,15 @@ def h_features(taxels: NDArray[Any], rate_hz: float, window: str = "rect") -> Ar
     and each short window is divided by its sum over q: it sums to 1, or is 0 if silent. Raises
     FormatError as `h_shape` does, if the array is not a sweep, and for an unknown window function.
     """
-    x = time_series.of(taxels)
+    x = series_of(taxels)
     frames = x.shape[1]
     count, bands = h_shape(frames, rate_hz)
     width, top = _short_window(frames, rate_hz)
     cut = _cuts(x, count, width, HOP_S * rate_hz) * _window(window, width)
-    power = time_series.power(cut, frames)[:, :, : top + 1]
+    power = power_spectrum(cut, frames)[:, :, : top + 1]
     power[:, :, 0] = 0.0
     total = np.zeros((count, 2 * bands))
-    total[:, : top + 1] = np.tensordot(time_series.weights(x, axes(taxels)), power, 1)
+    total[:, : top + 1] = np.tensordot(taxel_weights(x, axes(taxels)), power, 1)
     paired = total.reshape(count, bands, 2).sum(axis=2)
     normalised: Array = paired / np.maximum(paired.sum(axis=1, keepdims=True), SILENT)
     return normalised.ravel()
@@ -151,7 +206,7 @@ def _centroid(
 
 def _short_window(frames: int, rate_hz: float) -> tuple[int, int]:
     """(W, K): number of frames in a short window, and its highest bin that is used."""
-    time_series.check_rate(rate_hz)
+    check_rate(rate_hz)
     width = round(WINDOW_S * rate_hz)
     if HOP_S * rate_hz < 1:
         raise FormatError(

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.answer import features, time_series
+from palpate.answer import features
 from palpate.core.errors import FormatError
 from palpate_studies.peers.prior_features import correlation, spectrogram, static
 from tests.factories.any_counts import any_counts
@@ -49,7 +49,9 @@ def test_a_spectrogram_is_its_formula():
     bins = np.array(
         [np.abs(shaped @ np.exp(-2j * np.pi * q * n / 300)) ** 2 / 300 for q in range(1, 151)]
     )
-    want = np.log(bins.reshape(25, 6, 6).mean(axis=1) @ features.taxel_weights(x))
+    want = np.log(
+        bins.reshape(25, 6, 6).mean(axis=1) @ features.taxel_weights(features.series_of(x))
+    )
     np.testing.assert_allclose(spectrogram(x, RATE).reshape(5, 25)[1], want)
 
 
@@ -102,7 +104,9 @@ def test_still_taxels_and_rounded_means_are_none():
     x = noise()
     centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
     assert centred.mean(axis=0, dtype=np.float64).any()
-    np.testing.assert_array_equal(features.taxel_weights(centred), np.full(6, 1 / 6))
+    np.testing.assert_array_equal(
+        features.taxel_weights(features.series_of(centred)), np.full(6, 1 / 6)
+    )
     assert not static(centred, RATE)[:6].any()
     assert correlation(centred, RATE)[8] == 0
 
@@ -111,7 +115,7 @@ def test_still_taxels_and_rounded_means_are_none():
 def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
     """Constant counts: floors, rates and levels, nothing else."""
     x = np.full((100, 2, 2), level, np.uint8)
-    low = math.log(time_series.FLOOR)
+    low = math.log(features.FLOOR)
     np.testing.assert_allclose(spectrogram(x, RATE), np.full(125, low))
     np.testing.assert_allclose(correlation(x, RATE), [low, RATE, 1, 0, 0, 0, 0, low, level])
     whole = [level, 0, level, level, 0, 0, float(level > 0)]

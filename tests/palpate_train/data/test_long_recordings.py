@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer import time_series
+from palpate.answer import features
 from palpate.answer.slide import vibration
 from palpate.answer.unloaded import UnloadedSkin
 from palpate.answer.window import Window
@@ -53,7 +53,7 @@ CASES: dict[str, tuple[Callable[[], Any], Any, float]] = {
         0.06,
     ),
     "window": (lambda: Window(COUNTS[:WINDOW]).mean, EXACT[:WINDOW].mean(axis=0).ravel(), 1e-3),
-    "features": (lambda: time_series.means(time_series.of(COUNTS)), EXACT.mean(0).ravel(), 1e-6),
+    "features": (lambda: features.means(features.series_of(COUNTS)), EXACT.mean(0).ravel(), 1e-6),
     "vibration": (
         lambda: vibration(COUNTS[:WINDOW], np.zeros((2, 2)), 1),
         np.log(np.sqrt(EXACT[:WINDOW].var(axis=0).mean()) / EXACT[:WINDOW].mean()),

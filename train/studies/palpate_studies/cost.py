@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from palpate.answer import features, time_series
+from palpate.answer import features
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 
@@ -104,7 +104,7 @@ def feature_macs(kind: str, format: SweepFormat) -> int:
     if kind == "raw":
         return 0
     transforms: list[int] = []
-    power = time_series.power
+    power = features.power_spectrum
 
     def counted(x: Any, frames: int) -> Any:
         transforms.append(round(x.size * log2(max(x.shape[-1], 1))))
@@ -112,6 +112,6 @@ def feature_macs(kind: str, format: SweepFormat) -> int:
 
     rng = np.random.default_rng(0)  # noise, because a transform of a silent sweep might be skipped
     counts = rng.integers(0, 100, (format.window, *format.shape)).astype(format.numpy_type)
-    with mock.patch.object(time_series, "power", counted):
+    with mock.patch.object(features, "power_spectrum", counted):
         features.compute(kind, counts, format.rate_hz)
     return sum(transforms)

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer import time_series
-from palpate.answer.features import axes
+from palpate.answer import features
 from palpate.core.errors import FormatError
 
 Array = NDArray[np.float64]
@@ -43,15 +42,15 @@ def static(taxels: NDArray[Any], rate_hz: float) -> Array:
     The choice is ours: a pressure skin lacks their best features, temperature and thermal flow. One
     frame is enough. Raises FormatError for an array that is not a sweep.
     """
-    x = time_series.of(taxels)
-    load = x[axes(taxels) - 1 :: axes(taxels)]
-    mean, pressure = time_series.means(load), load.mean(axis=0)
+    x = features.series_of(taxels)
+    load = x[features.axes(taxels) - 1 :: features.axes(taxels)]
+    mean, pressure = features.means(load), load.mean(axis=0)
     rows, cols = taxels.shape[1:3]
     position = np.indices((rows, cols)).reshape(2, -1) - (np.array([[rows], [cols]]) - 1) / 2
     area = np.mean(mean > LOADED * mean.max())
-    whole = [time_series.means(pressure[None])[0], pressure.std(), pressure.min(), pressure.max()]
-    centre = position @ time_series.weights(load)
-    return np.concatenate([time_series.means(x), x.std(axis=1), whole, centre, [area]])
+    whole = [features.means(pressure[None])[0], pressure.std(), pressure.min(), pressure.max()]
+    centre = position @ features.taxel_weights(load)
+    return np.concatenate([features.means(x), x.std(axis=1), whole, centre, [area]])
 
 
 def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
@@ -66,22 +65,22 @@ def spectrogram(taxels: NDArray[Any], rate_hz: float) -> Array:
     least FLOOR: a silent skin gives log(FLOOR). Raises FormatError for an array that is not a
     sweep, and if a part would have fewer than four frames.
     """
-    x = time_series.of(taxels)
+    x = features.series_of(taxels)
     if x.shape[1] < 4 * TIME_BINS:
         raise FormatError(
             f"{x.shape[1]} frames are too few for a spectrogram; "
             f"use at least {4 * TIME_BINS}, or L-features"
         )
-    weights = time_series.weights(x, axes(taxels))
+    weights = features.taxel_weights(x, features.axes(taxels))
     parts = []
     for part in np.array_split(x, TIME_BINS, axis=1):
         frames = part.shape[1]
         hann = np.sin(np.pi * (np.arange(frames) + 0.5) / frames) ** 2
         shaped = np.zeros((len(x), max(frames, 2 * FREQUENCY_BINS)))
         shaped[:, :frames] = (part - part.mean(axis=1, keepdims=True)) * hann
-        power = weights @ time_series.power(shaped, frames)[:, 1:]
+        power = weights @ features.power_spectrum(shaped, frames)[:, 1:]
         parts += [band.mean() for band in np.array_split(power, FREQUENCY_BINS)]
-    log_power: Array = np.log(np.maximum(parts, time_series.FLOOR))
+    log_power: Array = np.log(np.maximum(parts, features.FLOOR))
     return log_power
 
 
@@ -105,8 +104,8 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
     `rate_hz` and complexity 1. Raises FormatError for an array that is not a sweep, fewer than
     three frames, or an invalid rate.
     """
-    x = time_series.of(taxels)
-    time_series.check_rate(rate_hz)
+    x = features.series_of(taxels)
+    features.check_rate(rate_hz)
     from scipy.stats import rankdata  # only here: every process of the tests would load it
 
     if x.shape[1] < 3:
@@ -115,13 +114,13 @@ def correlation(taxels: NDArray[Any], rate_hz: float) -> Array:
             "use at least 3, or L-features"
         )
     centred = x - x.mean(axis=1, keepdims=True)
-    varying = centred[centred.var(axis=1) > time_series.FLOOR]
+    varying = centred[centred.var(axis=1) > features.FLOOR]
     covariance = np.sqrt(_sum_of_squared_products(centred)) / x.shape[1]
     ranks = rankdata(varying, axis=1) - (x.shape[1] + 1) / 2  # equal values share their mean rank
     together = [*_pairs(varying), *_pairs(ranks)]
-    last = [np.log(max(covariance, time_series.FLOOR)), time_series.means(x.mean(axis=0)[None])[0]]
+    last = [np.log(max(covariance, features.FLOOR)), features.means(x.mean(axis=0)[None])[0]]
     return np.concatenate(
-        [_hjorth(x, rate_hz) @ time_series.weights(x, axes(taxels)), together, last]
+        [_hjorth(x, rate_hz) @ features.taxel_weights(x, features.axes(taxels)), together, last]
     )
 
 
@@ -129,7 +128,7 @@ def _hjorth(x: Array, rate_hz: float) -> Array:
     """Activity, mobility and complexity [3, M] of each series in `x` [M, T]."""
     change = np.diff(x, axis=1)
     variances = [
-        np.maximum(s.var(axis=1), time_series.FLOOR) for s in (x, change, np.diff(change, axis=1))
+        np.maximum(s.var(axis=1), features.FLOOR) for s in (x, change, np.diff(change, axis=1))
     ]
     mobility, of_change = (np.sqrt(after / before) for before, after in pairwise(variances))
     return np.array([np.log(variances[0]), mobility * rate_hz, of_change / mobility])
