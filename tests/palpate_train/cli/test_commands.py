@@ -18,7 +18,7 @@ from palpate.core.errors import FormatError
 from palpate_train.cli import bundles, fit
 from palpate_train.cli.main import PROGRAM, main
 from palpate_train.data import pull, sets
-from palpate_train.metrics.answers import Answers
+from palpate_train.metrics.score import Answers
 from palpate_train.models.recipe.fitted import Fit
 from tests.factories.sweep_sets import easy
 

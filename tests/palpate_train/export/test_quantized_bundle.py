@@ -38,7 +38,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.export import contents, pack, quantized_bundle
 from palpate_train.export.contents import ExportRefused
 from palpate_train.metrics import bundle_score, tolerances
-from palpate_train.metrics.answers import REFUSED
+from palpate_train.metrics.score import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit

@@ -47,8 +47,7 @@ from palpate_train.answer.stranger_limits import (
     limits,
     nearest_other,
 )
-from palpate_train.metrics.answers import UNKNOWN, Answers
-from palpate_train.metrics.score import fuse
+from palpate_train.metrics.score import UNKNOWN, Answers, fuse
 from palpate_train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]

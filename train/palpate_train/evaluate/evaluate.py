@@ -20,8 +20,16 @@ from palpate_train.data.sets import Dataset, digest
 from palpate_train.data.splitters import Protocol, draw
 from palpate_train.evaluate import parallel
 from palpate_train.evaluate.fold import AsTheBox, Fold, FoldTask, key, run
-from palpate_train.metrics.answers import REFUSED, UNKNOWN, outcomes
-from palpate_train.metrics.score import confusion, fuse, interval, provenance, score_entry
+from palpate_train.metrics.score import (
+    REFUSED,
+    UNKNOWN,
+    confusion,
+    fuse,
+    interval,
+    outcomes,
+    provenance,
+    score_entry,
+)
 from palpate_train.models import methods as known_methods
 from palpate_train.models.methods import FULL_EFFORT, Effort
 from palpate_train.onnx_tools import parity

@@ -68,7 +68,7 @@ LIBRARIES = (
 
 AsTheBox = Callable[[methods.Model, Dataset], tuple[Array, Array] | None]
 """The box's answers to n sweeps by a trained model: labels int [n], or REFUSED or UNKNOWN of
-palpate_train.metrics.answers, and bool [n], whether it is certain of them. None if the model is of
+palpate_train.metrics.score, and bool [n], whether it is certain of them. None if the model is of
 a method that export does not pack."""
 
 

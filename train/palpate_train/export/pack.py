@@ -35,7 +35,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.export import card, fit_rules
 from palpate_train.export.contents import Content, ExportRefused, files_of, means_file
 from palpate_train.metrics import bundle_score
-from palpate_train.metrics.answers import REFUSED, UNKNOWN
+from palpate_train.metrics.score import REFUSED, UNKNOWN
 from palpate_train.models.methods import model_inputs
 from palpate_train.onnx_tools.graph_builder import run
 

@@ -17,8 +17,15 @@ from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier, EarlyExit
 from palpate_train.data.sets import Dataset, digest
-from palpate_train.metrics.answers import REFUSED, UNKNOWN, Answers, outcomes
-from palpate_train.metrics.score import interval, provenance, score_entry
+from palpate_train.metrics.score import (
+    REFUSED,
+    UNKNOWN,
+    Answers,
+    interval,
+    outcomes,
+    provenance,
+    score_entry,
+)
 
 Array = NDArray[Any]
 CLUSTERS = ("position", "session", "object")
@@ -71,7 +78,7 @@ def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answer
 
 
 def outcomes_of(classifier: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
-    """The outcome of each sweep, as answers.outcomes. lost: frames of each that never arrived."""
+    """The outcome of each sweep, as score.outcomes. lost: frames of each that never arrived."""
     known = classifier.bundle.manifest.labels
     numbers = [known.index(m) if m in known else len(known) for m in sweeps.materials]
     named, sure = labels_of(classifier, sweeps, lost=lost)

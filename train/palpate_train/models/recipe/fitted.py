@@ -32,7 +32,7 @@ from palpate_train.data.augment import COPIES, Augmentation, copies
 from palpate_train.data.junk import JUNK, windows
 from palpate_train.data.sets import OWN_NUMBERS, Dataset
 from palpate_train.data.splitters import WEIGHT
-from palpate_train.metrics.answers import outcomes
+from palpate_train.metrics.score import outcomes
 from palpate_train.models.linear_head import hold_out
 from palpate_train.models.methods import Model
 from palpate_train.models.recipe import graph, spectrum
