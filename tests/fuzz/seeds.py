@@ -131,8 +131,8 @@ def capture() -> list[bytes]:
             now = begin + i * 8_000_000
             writer.transfer(now, packets.pack(6 * i, 8000 * i, frames[6 * i : 6 * i + 6]))
             if i in (2, 4):
-                writer.edges(now + 2, [Edge((EdgeKind.START, EdgeKind.STOP)[i // 4], now + 1)])
-        writer.edges(begin + 45_000_000, [Edge(EdgeKind.START, begin + 44_000_000, 30.0, 1.5)])
+                writer.triggered(now + 2, [Edge((EdgeKind.START, EdgeKind.STOP)[i // 4], now + 1)])
+        writer.triggered(begin + 45_000_000, [Edge(EdgeKind.START, begin + 44_000_000, 30.0, 1.5)])
         writer.command(begin + 50_000_000, "NEW")
         writer.state(begin + 60_000_000, "lost")
         writer.close()

@@ -21,7 +21,7 @@ class Observer:
     def frames(self, frames: Frames) -> None:
         """Frames have come, at least one."""
 
-    def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
+    def triggered(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Edges have settled, by `t_ns`."""
 
     def command(self, t_ns: int, line: str) -> None:

@@ -42,9 +42,9 @@ Say = Callable[[str], object]
 """Shows a message to a person."""
 
 
-class LinelessTrigger:
+class LinelessTrigger(Observer):
     """The common part of these triggers: edges are kept for the next turn of the loop, and none is
-    lost. about: for the sidecar of a recorded sweep, as in GpioTrigger."""
+    lost. It also observes the loop. about: for the sidecar of a recorded sweep, as in GpioTrigger."""
 
     blind = False
     due_ns: int = 0
@@ -137,9 +137,9 @@ class KeyTrigger(LinelessTrigger):
             self._say(f"{kind}: the space bar stops the sweep" if self._sweeping else str(kind))
         return super().edges(now_ns)
 
-    def over(self, sweep: int) -> None:
-        """Note that the sweep of this number was answered."""
-        if sweep == self._started:  # a late answer to an older sweep changes nothing
+    def answered(self, verdict: Verdict) -> None:
+        """Note that a sweep is over."""
+        if verdict.sweep == self._started:  # a late answer to an older sweep changes nothing
             self._sweeping = False
 
     def close(self) -> None:
@@ -162,7 +162,8 @@ class KeyTrigger(LinelessTrigger):
 
 class TimedTrigger(LinelessTrigger):
     """Starts a sweep of `sweep_s` every `every_s` and announces it. Raises ConfigError if `every_s`
-    is not longer. held: no sweep is started; afterwards the pause before a sweep begins again."""
+    is not longer. held: no sweep is started, while the skin sends nothing; afterwards the pause
+    before a sweep begins again."""
 
     def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
         super().__init__("timed", "clock of the box")
@@ -174,7 +175,10 @@ class TimedTrigger(LinelessTrigger):
         self._say = say
         self._next_ns = clock.now_ns() + self._every_ns - self._sweep_ns
         self._sweeping, self._announced = False, COUNTDOWN + 1
-        self.held = False
+        self.held = True
+
+    def turn(self, health: Health) -> None:
+        self.held = not health.streams
 
     def edges(self, now_ns: int) -> list[Edge]:
         """START and STOP that are due, with the time at which each was due."""
@@ -198,27 +202,6 @@ class TimedTrigger(LinelessTrigger):
             self._say(f"start in {left} s")
         self.due_ns = self._next_ns
         return super().edges(now_ns)
-
-
-class AnswerWatch(Observer):
-    """Notifies a KeyTrigger of answered sweeps."""
-
-    def __init__(self, trigger: KeyTrigger) -> None:
-        self._trigger = trigger
-
-    def answered(self, verdict: Verdict) -> None:
-        self._trigger.over(verdict.sweep)
-
-
-class StreamWatch(Observer):
-    """Holds a TimedTrigger while the skin sends nothing, so that nobody slides a finger in vain."""
-
-    def __init__(self, trigger: TimedTrigger) -> None:
-        self._trigger = trigger
-        trigger.held = True
-
-    def turn(self, health: Health) -> None:
-        self._trigger.held = not health.streams
 
 
 def standard_input() -> int:

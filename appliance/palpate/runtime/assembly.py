@@ -28,10 +28,9 @@ from palpate.inference.session import try_all
 from palpate.io import skins
 from palpate.io.gpio_lines import Lines
 from palpate.io.lineless_triggers import (
-    AnswerWatch,
     CommandTrigger,
     KeyTrigger,
-    StreamWatch,
+    LinelessTrigger,
     TimedTrigger,
     standard_input,
 )
@@ -85,7 +84,9 @@ def assembled(
     serving: whether READY may rise."""
     settings = devices.wire(settings)
     trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
-    watching = [answerer, *observers, *([capture] if capture else []), *_watches(trigger)]
+    watching = [answerer, *observers, *([capture] if capture else [])]
+    if isinstance(trigger, LinelessTrigger):
+        watching.append(trigger)
     commands = {**commands, "LABEL": partial(_label, codes)}
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
@@ -108,13 +109,6 @@ def assembled(
         source=devices.source,
         state_s=settings.serial.state_s,
     )
-
-
-def _watches(trigger: Trigger) -> list[Observer]:
-    """The observers that a trigger without lines needs."""
-    if isinstance(trigger, KeyTrigger):
-        return [AnswerWatch(trigger)]
-    return [StreamWatch(trigger)] if isinstance(trigger, TimedTrigger) else []
 
 
 def _trigger(

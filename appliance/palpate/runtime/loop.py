@@ -37,7 +37,7 @@ FAILURES, SOUND = 3, 20
 is started again, and the end counts against a bundle on trial."""
 LEAST_NS, QUICK_NS, PAUSES = 1_000_000, 20_000_000, 30
 """Shortest and longest answer that is rehearsed, and the pause after it in lengths of an answer."""
-EVENTS = ("frames", "edges", "command", "answered", "sweep", "turn", "stopping")
+EVENTS = ("frames", "triggered", "command", "answered", "sweep", "turn", "stopping")
 """The methods of an Observer."""
 
 
@@ -154,7 +154,7 @@ class Box:
         self._cutter.trigger(self._edges, ready, now_ns)
         edges, self._edges = self._edges, []
         if edges:
-            self._notify("edges", now_ns, edges)
+            self._notify("triggered", now_ns, edges)
 
     def _end(self) -> None:
         """Answer each open sweep, whatever has failed; a failed step is tried twice."""

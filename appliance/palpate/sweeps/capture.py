@@ -89,7 +89,7 @@ class CaptureWriter(Observer):
     def state(self, t_ns: int, state: str) -> None:
         self._write(RecordKind.STATE, t_ns, state.encode())
 
-    def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
+    def triggered(self, t_ns: int, edges: Sequence[Edge]) -> None:
         """Write edges that the trigger returned at `t_ns`."""
         rows = [(e.t_ns, _KINDS.index(e.kind), e.speed_mm_s or 0, e.force_n or 0) for e in edges]
         self._write(RecordKind.EDGES, t_ns, b"".join(_EDGE.pack(*row) for row in rows))

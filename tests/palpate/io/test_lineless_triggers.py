@@ -16,7 +16,7 @@ from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, ConfigError, PortError
 from palpate.core.sentences import MAX_LINE, sentence
 from palpate.core.types import Edge, EdgeKind, Status, Verdict
-from palpate.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger
+from palpate.io.lineless_triggers import CommandTrigger, KeyTrigger, TimedTrigger
 from palpate.sim import devices, rig, skin
 from tests.factories.simulated_box import SECOND, idle_devices, tubes
 
@@ -151,13 +151,12 @@ def test_after_an_answer_the_space_bar_starts(terminal):
     """A sweep that was answered `long` is over; a late answer to an older one changes nothing."""
     far, near = terminal
     with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
-        watch = AnswerWatch(trigger)
         os.write(far, b" ")
         assert kinds(trigger.edges(1)) == [START]
-        watch.answered(answer(1))
+        trigger.answered(answer(1))
         os.write(far, b" ")
         assert kinds(trigger.edges(2)) == [START]
-        watch.answered(answer(1))
+        trigger.answered(answer(1))
         os.write(far, b" ")
         assert kinds(trigger.edges(3)) == [STOP]
 
@@ -192,7 +191,9 @@ def timed(every_s: float = 5.0, sweep_s: float = 3.0) -> tuple[TimedTrigger, lis
     """A trigger by the clock, and its messages."""
     said: list[str] = []
     config = TriggerConfig(mode="timed", every_s=every_s, sweep_s=sweep_s)
-    return TimedTrigger(config, rig.VirtualClock(0), said.append), said
+    trigger = TimedTrigger(config, rig.VirtualClock(0), said.append)
+    trigger.held = False
+    return trigger, said
 
 
 def test_the_clock_starts_and_stops():

@@ -148,7 +148,7 @@ def test_a_restart_keeps_the_capture_before(tmp_path, path, logged):
     """The next number; too many refuse the start."""
     for edges in range(3):
         capture = CaptureWriter(path, skin.FORMAT)
-        capture.edges(7, [Edge(EdgeKind.START, 7)] * edges)
+        capture.triggered(7, [Edge(EdgeKind.START, 7)] * edges)
         capture.close()
     sizes = [(tmp_path / name).stat().st_size for name in ("capture.1", "capture.2", "capture")]
     assert sizes == sorted({*sizes})
@@ -182,8 +182,8 @@ def test_speed_and_force_are_part_of_a_capture(path):
     """Edges come back with them, and edges without them, too."""
     plain, with_speed = Edge(EdgeKind.STOP, 5), Edge(EdgeKind.START, 6, 30.0)
     capture = CaptureWriter(path, skin.FORMAT)
-    capture.edges(7, [plain])
-    capture.edges(8, [plain, with_speed, Edge(EdgeKind.START, 7, 0.1, 1.5)])
+    capture.triggered(7, [plain])
+    capture.triggered(8, [plain, with_speed, Edge(EdgeKind.START, 7, 0.1, 1.5)])
     capture.command(9, "START,30")
     capture.close()
     play = Playback(path)
@@ -197,7 +197,7 @@ def test_speed_and_force_are_part_of_a_capture(path):
 def test_a_record_that_was_never_written_is_refused(path, value):
     """A speed that the box cannot have received, and a record of an unknown kind."""
     capture = CaptureWriter(path, skin.FORMAT)
-    capture.edges(7, [Edge(EdgeKind.START, 6, value)])
+    capture.triggered(7, [Edge(EdgeKind.START, 6, value)])
     capture.close()
     with pytest.raises(FormatError, match=r"2 .* \d+"):
         Playback(path)
