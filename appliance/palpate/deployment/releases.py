@@ -30,7 +30,7 @@ from palpate.core import storage
 from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.schema import typed
 from palpate.core.text import printable
-from palpate.deployment.state import MOST_CUTS, MOST_STARTS, MOST_WHY, Standing, TrialProgress
+from palpate.deployment.state import MOST_STARTS, MOST_WHY, Standing, TrialProgress
 
 FOLDER, NAME = Path("/opt"), "palpate"
 """Folder of the releases and of the link, and the name of the link."""
@@ -95,7 +95,7 @@ def read_report(folder: Path, trial: RootState) -> ReleaseReport:
 
 def write_report(folder: Path, report: ReleaseReport) -> None:
     """Raises OSError."""
-    storage.put(folder / REPORT, json.dumps(asdict(report)).encode(), mode=0o644)
+    _put(folder / REPORT, report)
 
 
 class Releases:
@@ -147,8 +147,7 @@ class Releases:
         proven = trial.back if trial else now
         if proven not in ("", name):
             storage.link(self._previous, proven)
-            begun = RootState(name, proven, os.urandom(8).hex())
-            storage.put(self._trial, _json(asdict(begun)), mode=0o644)
+            _put(self._trial, RootState(name, proven, os.urandom(8).hex()))
         storage.link(self._link, name)
         if proven == name:
             storage.link(self._previous, now)
@@ -166,12 +165,10 @@ class Releases:
         why = self.rejected.get(trial.release, [report.why])[0]
         if report.passed and not why:
             self._end_trial()
-        elif why := why or _wrong(held):
+        elif why := why or held.spent(f"{MOST_STARTS} starts ended without an orderly end"):
             return self._send_back(trial, why)
         else:
-            counted = replace(held, starts=held.starts + 1, boot=boot, worked=False)
-            begun = replace(trial, start=trial.start + 1, standing=counted)
-            storage.put(self._counts, _json(asdict(begun)), mode=0o644)
+            _put(self._counts, replace(trial, start=trial.start + 1, standing=held.begun(boot)))
         return ""
 
     def _judged(self, trial: RootState, report: ReleaseReport, boot: str) -> Standing:
@@ -189,9 +186,7 @@ class Releases:
         if not (self.folder / trial.back).is_dir():
             return ""  # nothing better is there
         text = printable(why, " ")[:MOST_WHY]
-        storage.put(
-            self._rejected, _json({**self.rejected, trial.release: [text, trial.back]}), mode=0o644
-        )
+        _put(self._rejected, self.rejected | {trial.release: [text, trial.back]})
         storage.link(self._link, trial.back)
         self._end_trial()
         return f"{trial.release} was sent back, and {trial.back} runs again: {text}"
@@ -266,17 +261,9 @@ def _target(link: Path) -> str:
         return ""
 
 
-def _json(held: object) -> bytes:
-    return (json.dumps(held, indent=1) + "\n").encode()
-
-
-def _wrong(held: Standing) -> str:
-    """Why a release must not be started again, "" if it may."""
-    if held.starts >= MOST_STARTS:
-        return f"{MOST_STARTS} starts ended without an orderly end"
-    if held.cuts >= MOST_CUTS:
-        return f"the box was switched off {MOST_CUTS} times, each time soon after its start"
-    return ""
+def _put(path: Path, held: RootState | ReleaseReport | dict[str, list[str]]) -> None:
+    text = json.dumps(held if isinstance(held, dict) else asdict(held), indent=1)
+    storage.put(path, f"{text}\n".encode(), mode=0o644)
 
 
 if __name__ == "__main__":

@@ -92,6 +92,18 @@ class Standing:
         cuts += not self.worked
         return replace(self._settled(), starts=self.starts - 1, cuts=cuts, boot="")
 
+    def begun(self, boot: str) -> Standing:
+        """The state with one more start, in this boot."""
+        return replace(self, starts=self.starts + 1, boot=boot, worked=False)
+
+    def spent(self, started: str) -> str:
+        """Why no further start may follow, "" if one may. started: the words for too many."""
+        if self.starts >= MOST_STARTS:
+            return self.why or started
+        if self.cuts >= MOST_CUTS:
+            return f"the box was switched off {MOST_CUTS} times, each time soon after its start"
+        return ""
+
     def noted(self, progress: TrialProgress, boot: str) -> Standing:
         """The state with the progress of a start. boot: "" if the start does not count, so that its
         progress holds. Less progress than before holds, too: the trial has begun anew."""

@@ -43,7 +43,6 @@ from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.sandbox import run_limited
 from palpate.deployment.signed import PACKAGER, BundleFolder, SignedBundle
 from palpate.deployment.state import (
-    MOST_CUTS,
     MOST_STARTS,
     PACKAGED,
     STATE_FILE,
@@ -317,13 +316,9 @@ class Store:
         """Count a start of `sha`. Returns why it must not be started again, "" if it may."""
         with self._locked() as state:
             standing = state.of(sha).since(self._boot)
-            if standing.starts >= MOST_STARTS:
-                return standing.why or f"it was started {MOST_STARTS} times without being committed"
-            if standing.cuts >= MOST_CUTS:
-                return f"the box was switched off {MOST_CUTS} times, each time soon after its start"
-            starts = standing.starts + 1
-            begun = replace(standing, starts=starts, boot=self._boot, worked=False)
-            self._write(state.changed(sha, **asdict(begun)))
+            if why := standing.spent(f"it was started {MOST_STARTS} times without being committed"):
+                return why
+            self._write(state.changed(sha, **asdict(standing.begun(self._boot))))
         return ""
 
     @property

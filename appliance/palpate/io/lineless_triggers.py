@@ -44,7 +44,7 @@ Say = Callable[[str], object]
 
 class LinelessTrigger(Observer):
     """The common part of these triggers: edges are kept for the next turn of the loop, and none is
-    lost. It also observes the loop. about: for the sidecar of a recorded sweep, as in GpioTrigger."""
+    lost. It observes the loop. about: for the sidecar of a recorded sweep, as in GpioTrigger."""
 
     blind = False
     due_ns: int = 0
