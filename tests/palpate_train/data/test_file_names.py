@@ -42,7 +42,6 @@ def test_a_name_that_fits_in_several_ways_is_refused():
 @pytest.mark.parametrize(
     ("pattern", "message"),
     [
-        ("{trial}.csv", "where"),
         ("*/{material}.csv", "for any text"),
         ("{material}_{a}_{a}.csv", "'a' stands twice"),
         ("{material}_{A}.csv", "'A'"),

@@ -129,7 +129,7 @@ def test_a_pattern_without_a_field_matches(tmp_path: Path, changes: dict):
         rows["what"], rows["taxels"] = name, COUNTS + len(name) + (name == "felt")
         np.savez(tmp_path / f"{name}.npz", rows)
     np.savez(tmp_path / "other.zip.npz", COUNTS)
-    names = NamePattern("{}t.npz", ("material",))
+    names = NamePattern("{}t.npz")
     given = {"pattern": names, "fields": {"material": "what"}} | changes
     (tmp_path / "cork.npz").rename(tmp_path / "corkt.npz")
     found = reasons(tmp_path, **given)
@@ -401,7 +401,7 @@ def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: st
         )
     made = taken(
         tmp_path,
-        pattern=NamePattern("{session}.{}", ("material", "trial")),
+        pattern=NamePattern("{session}.{}"),
         variable="{material}_{trial:d}",
     ).sweeps
     assert made.materials == ("felt", "wool")
@@ -440,6 +440,7 @@ def test_arrays_alone_say_all_or_are_named(tmp_path: Path):
     [
         ("{material", "{material}.csv", "--variable '{material'"),
         ("{trial}", None, "--variable '{trial}'"),
+        ("", "{trial}.csv", "not known in --pattern '{trial}.csv'"),
         ("{material}", "{material}.csv", "--pattern and"),
         ("{material}{recording}", None, "--variable"),
     ],

@@ -15,7 +15,7 @@ from palpate_train.arguments import options
 from palpate_train.arguments.options import FLAG, above_zero, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import label_table, labels, lerobot, summary
-from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
+from palpate_train.data.file_names import EXAMPLE, GROUP, NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
 from palpate_train.data.importing import Imported, LeftOutFile, Taken, check_folder, import_folder
 
@@ -90,9 +90,7 @@ def run(args: argparse.Namespace) -> None:
 def _plan(args: argparse.Namespace) -> ImportPlan:
     """The options as a plan. A LeRobot data set states its frame rate."""
     fields = dict(_field(text) for text in args.field)
-    in_variable = [name for name, _ in FIELD.findall(args.variable)]
     rate, table = args.rate, label_table.read(args.labels) if args.labels else {}
-    labelled = next(iter(table.values()), {})
     if not args.pattern and (inner := next(args.folder.glob(f"*/{lerobot.INFO}"), None)):
         raise FormatError(
             f"{args.folder}: {inner.parents[1]} in it is a LeRobot data set; name its folder"
@@ -100,7 +98,7 @@ def _plan(args: argparse.Namespace) -> ImportPlan:
     if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
         rate = lerobot.rate_hz(args.folder, args.variable, "" if args.columns else args.grid)
     return ImportPlan(
-        NamePattern(args.pattern, (*fields, *in_variable, *labelled)) if args.pattern else None,
+        NamePattern(args.pattern) if args.pattern else None,
         args.grid,
         args.columns,
         args.time,

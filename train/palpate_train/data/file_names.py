@@ -28,12 +28,10 @@ class NamePattern:
     """A pattern over paths below a folder, or over names of arrays; `{}` matches text that is
     ignored.
 
-    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them.
-    option: the name of the option in messages. Raises FormatError if the pattern cannot be read.
+    option: its name in messages. Raises FormatError if the pattern cannot be read.
     """
 
     text: str
-    elsewhere: tuple[str, ...] = ()
     option: str = "--pattern"
 
     def __post_init__(self) -> None:
@@ -47,11 +45,6 @@ class NamePattern:
             )
         if "*" in rest:
             raise FormatError(f"{self.option} {self.text!r} has a *; write {{}} for any text")
-        if "material" not in (*names, *self.elsewhere):
-            raise FormatError(
-                f"{self.option} {self.text!r} does not say where the material stands; "
-                f"write e.g. {EXAMPLE}"
-            )
         for name, kind in FIELD.findall(self.text):
             if name and (names.count(name) > 1 or not GROUP.fullmatch(name)):
                 raise FormatError(

@@ -133,10 +133,11 @@ class ImportPlan:
     def _check_fields(self) -> None:
         in_names = self.names[: len(self.names) - len(self.fields)]
         if "material" not in (*in_names, *self.fields):
+            given = (f" in {one.option} {one.text!r}" for one in self.patterns)
             raise FormatError(
-                "where the material stands is not known; give --pattern or --variable with "
-                "{material}, --labels FILE with a column material, or --field material=COLUMN if "
-                "a column holds it"
+                f"where the material stands is not known{' and'.join(given)}; give --pattern or "
+                "--variable with {material}, --labels FILE with a column material, or --field "
+                "material=COLUMN if a column holds it"
             )
         if both := [name for name in in_names if in_names.count(name) > 1]:
             raise FormatError(
@@ -163,8 +164,7 @@ class ImportPlan:
     @property
     def names(self) -> list[str]:
         """The names of all fields of a recording."""
-        patterns = [one for one in (self.pattern, self.variables) if one]
-        in_names = (name for one in patterns for name in one.names)
+        in_names = (name for one in self.patterns for name in one.names)
         return [*in_names, *self.labelled, *self.fields]
 
     @property
@@ -183,10 +183,13 @@ class ImportPlan:
         read."""
         if "{" not in self.variable:
             return None
-        elsewhere = (*self.of_files, *self.fields)
-        return NamePattern(self.variable, elsewhere, "--variable")
+        return NamePattern(self.variable, "--variable")
+
+    @property
+    def patterns(self) -> list[NamePattern]:
+        """The patterns of --pattern and --variable."""
+        return [one for one in (self.pattern, self.variables) if one]
 
     def pattern_of(self, name: str) -> NamePattern | None:
         """The pattern that has the field `name`, None if a column has it."""
-        patterns = (self.pattern, self.variables)
-        return next((one for one in patterns if one and name in one.names), None)
+        return next((one for one in self.patterns if name in one.names), None)

@@ -9,15 +9,14 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core import storage
 from palpate.core.errors import FormatError
+from palpate.core.sweep_set import Array
 from palpate.core.types import normal
 from palpate_train.data import readers, sets
 from palpate_train.data.extras import library
@@ -44,15 +43,9 @@ TOPICS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 """Schema and properties of each topic."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SweepToWrite:
-    """A sweep. taxels: [T, R, C] or [T, R, C, A] raw counts. t_ns: [T] from its first frame on.
-    verdict: as the box wrote it, {} for none."""
-
-    taxels: NDArray[Any]
-    t_ns: NDArray[np.int64]
-    material: str
-    verdict: Mapping[str, Any]
+Sweep = tuple[Array, Array, str, Mapping[str, Any]]
+"""Raw counts [T, R, C] or [T, R, C, A], times [T] in ns from its first frame on, material, and the
+verdict as the box wrote it, {} for none."""
 
 
 def write(source: str, out: Path) -> tuple[int, int]:
@@ -69,12 +62,12 @@ def write(source: str, out: Path) -> tuple[int, int]:
         writer = made.Writer(file)
         writer.start(library="palpate")
         channels = {topic: _channel(writer, topic) for topic in TOPICS}
-        for sweep in _sweeps(source):
-            for topic, at_ns, value in _messages(sweep):
-                t_ns, data = begun_ns + at_ns, json.dumps(value).encode()
-                writer.add_message(channels[topic], t_ns, data, t_ns)
-            begun_ns += int(sweep.t_ns[-1]) + PAUSE_NS
-            sweeps, frames = sweeps + 1, frames + len(sweep.taxels)
+        for taxels, t_ns, material, verdict in _sweeps(source):
+            for topic, at_ns, value in _messages(taxels, t_ns.tolist(), material, verdict):
+                at_ns, data = begun_ns + at_ns, json.dumps(value).encode()
+                writer.add_message(channels[topic], at_ns, data, at_ns)
+            begun_ns += int(t_ns[-1]) + PAUSE_NS
+            sweeps, frames = sweeps + 1, frames + len(taxels)
         writer.finish()
     return sweeps, frames
 
@@ -86,7 +79,7 @@ def _channel(writer: Any, topic: str) -> int:
     return int(writer.register_channel(topic, "json", known))
 
 
-def _sweeps(source: str) -> Iterator[SweepToWrite]:
+def _sweeps(source: str) -> Iterator[Sweep]:
     folder = Path(source)
     if folder.is_dir():
         for one in readers.read_recorded(folder):
@@ -94,29 +87,30 @@ def _sweeps(source: str) -> Iterator[SweepToWrite]:
             if len(frames):
                 t_ns = frames.t_ns - frames.t_ns[0]
                 verdict = dict(one.about.get("verdict", {}))
-                yield SweepToWrite(frames.taxels, t_ns, one.sweep.material, verdict)
+                yield frames.taxels, t_ns, one.sweep.material, verdict
         return
     found = sets.load(source)
     t_ns = np.rint(1e9 / found.rate_hz * np.arange(found.format.window)).astype(np.int64)
     for taxels, label in zip(found.samples, found.labels, strict=True):
-        yield SweepToWrite(taxels, t_ns, str(found.materials[label]), {})
+        yield taxels, t_ns, str(found.materials[label]), {}
 
 
-def _messages(sweep: SweepToWrite) -> Iterator[tuple[str, int, dict[str, Any]]]:
+def _messages(
+    taxels: Array, t_ns: list[int], material: str, verdict: Mapping[str, Any]
+) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time in ns and content, in the order of their times."""
     yield "/trigger", 0, {"data": "START"}
-    if sweep.material:
-        yield "/material", 0, {"data": sweep.material}
-    for taxels, t_ns in zip(sweep.taxels, sweep.t_ns.tolist(), strict=True):
-        yield "/skin", t_ns, {"taxels": _finite(taxels).ravel().tolist()}
-        yield "/skin/image", t_ns, _image(taxels, t_ns)
-    last_ns = int(sweep.t_ns[-1])
-    yield "/trigger", last_ns, {"data": "STOP"}
-    if sweep.verdict:
-        yield "/verdict", last_ns, dict(sweep.verdict)
+    if material:
+        yield "/material", 0, {"data": material}
+    for frame, at_ns in zip(taxels, t_ns, strict=True):
+        yield "/skin", at_ns, {"taxels": _finite(frame).ravel().tolist()}
+        yield "/skin/image", at_ns, _image(frame, at_ns)
+    yield "/trigger", t_ns[-1], {"data": "STOP"}
+    if verdict:
+        yield "/verdict", t_ns[-1], dict(verdict)
 
 
-def _finite(taxels: NDArray[Any]) -> NDArray[Any]:
+def _finite(taxels: Array) -> Array:
     """NaN as null, since JSON has no NaN."""
     if taxels.dtype.kind != "f" or np.isfinite(taxels).all():
         return taxels
@@ -125,7 +119,7 @@ def _finite(taxels: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-def _image(taxels: NDArray[Any], t_ns: int) -> dict[str, Any]:
+def _image(taxels: Array, t_ns: int) -> dict[str, Any]:
     grid = np.ascontiguousarray(normal(taxels, 0)).astype(taxels.dtype.newbyteorder("<"))
     sec, nsec = divmod(t_ns, 1_000_000_000)
     return {

@@ -27,8 +27,6 @@ from palpate_train.metrics.score import interval
 
 Json = dict[str, Any]
 Log = Callable[[str], None]
-NOT_NAMED = (f"({Status.UNSURE})", f"({Status.UNKNOWN})")
-"""Answers without a label that are not refusals, in the notation of BundleScore."""
 
 
 def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
@@ -96,7 +94,7 @@ def material(name: str, found: bundle_score.BundleScore) -> Json:
     others = sum(
         answers[name] for of, answers in (found.answered | found.foreign).items() if of != name
     )
-    unsure, unknown = (given[answer] for answer in NOT_NAMED)
+    unsure, unknown = (given[f"({status})"] for status in (Status.UNSURE, Status.UNKNOWN))
     refused = sum(n for answer, n in given.items() if answer.startswith("(")) - unsure - unknown
     return {
         "name": name,
@@ -112,10 +110,8 @@ def material(name: str, found: bundle_score.BundleScore) -> Json:
 
 def _commonest(given: Mapping[str, int], name: str) -> list[Any]:
     """The most frequent wrong label and its count; empty if there is none."""
-    wrong = Counter(
-        {answer: n for answer, n in given.items() if answer != name and not answer.startswith("(")}
-    )
-    return [*wrong.most_common(1)[0]] if wrong else []
+    wrong = [[of, n] for of, n in given.items() if of != name and not of.startswith("(")]
+    return max(wrong, key=lambda one: one[1], default=[])
 
 
 def _share(right: int, n: int) -> list[float]:

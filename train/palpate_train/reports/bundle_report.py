@@ -41,28 +41,6 @@ LINES = ["-", "--", ":", "-."]
 """Of the curves of conditions."""
 MOST_SHOWN = 6
 """Number of materials with an example sweep."""
-MATERIALS = [
-    "material",
-    "sweeps",
-    "classified correctly",
-    "correct where labelled",
-    "unsure",
-    "unknown",
-    "refused",
-    "taken for",
-]
-CORRUPTIONS = [
-    "what goes wrong",
-    "five points are lost at",
-    "at the largest tried: classified correctly / wrong label / no label",
-]
-LEFT_OUT = [
-    "left out of training",
-    "gets a known label",
-    "known sweeps kept",
-    "AUROC",
-    "sweeps, known / unknown",
-]
 
 
 def page(figures: Json, sweeps: Dataset) -> str:
@@ -74,21 +52,14 @@ def page(figures: Json, sweeps: Dataset) -> str:
         f=figures,
         pictures=_pictures(figures),
         short=list(_in_short(figures)),
-        right=[
-            figures["classified_correctly"]["right"] / figures["classified_correctly"]["total"],
-            *figures["classified_correctly"]["interval"],
-        ],
         statuses=sorted(figures["statuses"].items(), key=lambda item: -item[1]),
-        material_head=MATERIALS,
         materials=[_material(row) for row in figures["materials"]],
-        corruption_head=CORRUPTIONS,
         corruptions=[_corruption(row) for row in figures["corruptions"]],
         foreign=[_foreign(*item) for item in figures["not_in_the_bundle"].items()],
         stranger_costs={
             limit: stranger_limits.lines(figures["figures"], limit)
             for limit in stranger_limits.COSTS
         },
-        left_out_head=LEFT_OUT,
         left_out=_left_out(figures.get("left_out")),
         held_out=[
             [name, formatting.estimate([of[k] for k in ("accuracy", "low", "high")]), of["n"]]
@@ -232,12 +203,8 @@ def _corruption(row: Json) -> list[str]:
 
 def _examples(sweeps: Dataset) -> list[int]:
     """Numbers of example sweeps: the middle sweep of each of the first materials."""
-    labels = np.unique(sweeps.labels)[:MOST_SHOWN]
-    return [
-        int(own[len(own) // 2])
-        for label in labels
-        if len(own := np.flatnonzero(sweeps.labels == label))
-    ]
+    each = (np.flatnonzero(sweeps.labels == k) for k in np.unique(sweeps.labels)[:MOST_SHOWN])
+    return [int(own[len(own) // 2]) for own in each]
 
 
 def confusion(figures: Json) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 from palpate_train.reports import formatting, html, provenance, selection_plots
 
 Json = Mapping[str, Any]
-UNITS = {"ms": "ms", "kb": "kB"}
 NAMES = {
     "window": "window",
     "rate": "rate",
@@ -19,7 +18,6 @@ NAMES = {
     "bits": "bits",
     "classes": "materials",
 }
-HEAD = ["size", "ms", "kB", "MB", "of the budget", "right", "behind the best, in points"]
 
 
 def text(choice: Json) -> str:
@@ -63,8 +61,6 @@ def _facts(choice: Json) -> dict[str, Any]:
         "merged": _merged(choice),
         "caveats": list(_caveats(choice)),
         "models": [_row(model, choice["best"]) for model in models],
-        "model_head": HEAD,
-        "units": UNITS,
     }
 
 

@@ -263,15 +263,10 @@ def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
 
 def _about_spectrum(format: SweepFormat, still: int) -> str:
     """The caption of a spectrum. still: number of constant taxels, which are left out."""
-    rounding = (
-        "" if format.numpy_type.kind == "f" else "; dots: the noise of rounding to whole counts"
-    )
-    taxels = "taxel" if still == 1 else "taxels"
-    left_out = f"; without {still} constant {taxels}" if still else ""
-    return (
-        "raw counts per √Hz over Hz: mean power of the taxels; light: their range"
-        f"{rounding}{left_out}"
-    )
+    text = "raw counts per √Hz over Hz: mean power of the taxels; light: their range"
+    if format.numpy_type.kind != "f":
+        text += "; dots: the noise of rounding to whole counts"
+    return text + f"; without {still} constant taxel{'s' * (still > 1)}" * (still > 0)
 
 
 def _ends(inches: tuple[float, float]) -> tuple[float, float]:

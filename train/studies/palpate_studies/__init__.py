@@ -2,7 +2,3 @@
 
 `python -m palpate_studies` runs them. They may use all of `train`; nothing uses them.
 """
-
-from pathlib import Path
-
-TEMPLATES = Path(__file__).with_name("templates")

@@ -18,10 +18,11 @@ import numpy as np
 from palpate.answer.contact import centre
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
-from palpate.core.types import Frames, Status, Sweep
+from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
+from palpate_train.metrics import bundle_score
 from palpate_train.metrics.score import interval, provenance
 
 Json = dict[str, Any]
@@ -90,12 +91,9 @@ def _point(
     right, moved, wrong, unsure, unknown, network, distance_mm = (
         np.zeros(len(sweeps)) for _ in range(7)
     )
-    for i, window in enumerate(test.scene.draw(where)):
-        n = np.arange(len(window))
-        verdict, truth = (
-            box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window))),
-            sweeps.materials[sweeps.labels[i]],
-        )
+    drawn = replace(sweeps, samples=test.scene.draw(where))
+    for i, verdict in bundle_score.verdicts(box, drawn):
+        window, truth = drawn.samples[i], sweeps.materials[sweeps.labels[i]]
         named = verdict.status is Status.OK
         right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
         unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN

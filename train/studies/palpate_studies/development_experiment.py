@@ -7,11 +7,12 @@ among the sets, because the simulator cannot be trusted with it (decision 2).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from palpate_studies import differences
 from palpate_studies.fabrics_experiment import FABRICS, FOUR, SEVEN
 from palpate_studies.study import NO_DATA, StudyCase, StudyRun
 from palpate_train.data.sets import Dataset, digest
@@ -153,8 +154,4 @@ def _mean(results: Sequence[Json]) -> Json:
     """Results of several seeds of one protocol as one: means of accuracies and of the ends of
     intervals."""
     shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
-    ends: Iterable[float] = np.mean(shares, axis=0)
-    return {
-        name: round(float(share), 4)
-        for name, share in zip(("mean", "low", "high"), ends, strict=True)
-    }
+    return differences.entry([round(float(share), 4) for share in np.mean(shares, axis=0)])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_studies import TEMPLATES, development_plots, differences
+from palpate_studies import development_plots, differences
 from palpate_studies.development_chart import (
     ANSWER,
     Accuracies,
@@ -26,15 +26,16 @@ from palpate_studies.development_chart import (
 )
 from palpate_studies.development_experiment import OURS, PEERS
 from palpate_studies.method_names import about, plain_name
-from palpate_train.reports import html, provenance
+from palpate_studies.study import Rendered, drawn
+from palpate_train.reports import provenance
 from palpate_train.reports.formatting import amount, percent, points
 
 SIZES_OF = (("file_kb", "KB"), ("rss_mb", "MB"))
 """Costs of a model in bytes, with their units."""
 
 
-def render(figures: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. Raises FormatError without a result of a
+def render(figures: Json) -> Rendered:
+    """The page and its pictures. Raises FormatError without a result of a
     method of ours."""
     table = by_case(figures["results"])
     ours = subject(table)
@@ -46,14 +47,11 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         peers = {plain_name(n): row[n] for n in names if n not in OURS and n in row}
         lines.append(differences.line(plain_case(one), row[ours], peers))
     shown = panels(figures)
-    pictures = {"front": front(figures)} if shown else {}
-    page = html.render(
+    return drawn(
         "development.html.j2",
-        TEMPLATES,
-        header=provenance.of(figures),
-        home=html.HOME,
+        figures,
+        {"front": front(figures)} if shown else {},
         figures=figures,
-        pictures={name: html.picture(svg) for name, svg in pictures.items()},
         panels=[[panel.kind, finding(panel), len(panel.cases)] for panel in shown],
         ours=ours,
         names=names,
@@ -67,7 +65,6 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         **_costs(figures, table, names),
         **_words(cases, names, _missing(table, cases, names, figures["left_out"])),
     )
-    return page, pictures
 
 
 def front(figures: Json, plain: bool = False) -> str:

@@ -28,7 +28,7 @@ def of(entry: Mapping[str, Any]) -> Estimate:
     return entry["mean"], entry["low"], entry["high"]
 
 
-def entry(estimate: Estimate) -> dict[str, float]:
+def entry(estimate: Sequence[float]) -> dict[str, float]:
     """An estimate as an entry of results."""
     return dict(zip(("mean", "low", "high"), estimate, strict=True))
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.core.types import Verdict
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
 from palpate_train.data import sets
+from palpate_train.metrics import bundle_score
 from palpate_train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -48,9 +49,9 @@ def draw(material: str, seed: int = SEED) -> str:
         raise FormatError(
             f"material {material!r} is not simulated; use one of {', '.join(sweeps.materials)}"
         )
-    samples = sweeps.samples[sweeps.labels == sweeps.materials.index(material)][0]
-    loaded = bundle.load(bundle.DEFAULT)
-    verdict = _verdict(loaded, samples)
+    one = sweeps.take(np.flatnonzero(sweeps.labels == sweeps.materials.index(material))[:1])
+    samples, loaded = one.samples[0], bundle.load(bundle.DEFAULT)
+    ((_, verdict),) = bundle_score.verdicts(Classifier(loaded, SystemClock()), one)
     figure = Figure((WIDE, HIGH))
     page = add_axes(figure, 0, 1, 1, 0)
     page.set(xlim=(0, WIDE), ylim=(0, HIGH))
@@ -69,13 +70,6 @@ def draw(material: str, seed: int = SEED) -> str:
         f"the box answers {verdict.label}"
     )
     return to_svg(figure, about + " (simulated)", plain=True)
-
-
-def _verdict(loaded: bundle.Bundle, samples: NDArray[Any]) -> Verdict:
-    """The bundle's answer to raw counts [T, R, C]."""
-    number = np.arange(len(samples))
-    classifier = Classifier(loaded, SystemClock())
-    return classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, samples)))
 
 
 def _finger(page: Axes, samples: NDArray[Any]) -> None:

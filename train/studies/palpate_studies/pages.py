@@ -17,11 +17,9 @@ from palpate_studies import (
     stress_report,
     uncertainty_report,
 )
-from palpate_studies.study import DATA, read, results_file
+from palpate_studies.study import DATA, Rendered, read, results_file
 from palpate_train.reports import html
 
-Rendered = tuple[str, dict[str, str]]
-"""A page (HTML), and its pictures (SVG) by name."""
 BOX_ON_HARD = {"accuracy", "wrong_share", "network"}
 """Keys of the box's answers to T-HARD's sweeps in the results of `alignment`."""
 
@@ -35,24 +33,22 @@ class Page:
     render: Callable[[Any, Path], Rendered]
 
 
-def _paper(results: Any, folder: Path) -> Rendered:
-    return paper_report.render(results, box_on_hard(folder))
-
-
-def _alone(render: Callable[..., Rendered], **more: Any) -> Callable[[Any, Path], Rendered]:
-    """A page that needs no other results."""
-    return lambda results, folder: render(results, **more)
-
-
 PAGES: Mapping[str, Page] = {
     "development": Page(
         ("methods", "runs", "cases", "results", "left_out"),
-        _alone(development_report.render),
+        lambda results, _: development_report.render(results),
     ),
-    "stress-fabrics": Page(("methods", "box"), _alone(stress_report.render, name="stress-fabrics")),
-    "stress": Page(("methods", "box"), _alone(stress_report.render)),
-    "certainty": Page(("calibration", "early"), _alone(uncertainty_report.render)),
-    "paper": Page(("table", "results"), _paper),
+    "stress-fabrics": Page(
+        ("methods", "box"), lambda results, _: stress_report.render(results, "stress-fabrics")
+    ),
+    "stress": Page(("methods", "box"), lambda results, _: stress_report.render(results)),
+    "certainty": Page(
+        ("calibration", "early"), lambda results, _: uncertainty_report.render(results)
+    ),
+    "paper": Page(
+        ("table", "results"),
+        lambda results, folder: paper_report.render(results, box_on_hard(folder)),
+    ),
 }
 
 

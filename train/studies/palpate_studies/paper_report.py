@@ -7,10 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from palpate_studies import TEMPLATES, differences
-from palpate_studies.paper_experiment import ATTACHMENTS, BLIND, HARD, HARD_BLIND, OWN
-from palpate_studies.paper_values import CNN, CONFUSION, FIGURES, FIVE
-from palpate_train.reports import confusion_plot, html, provenance
+from palpate_studies import differences
+from palpate_studies.paper_experiment import (
+    ATTACHMENTS,
+    BASELINES,
+    BLIND,
+    CNN,
+    CONFUSION,
+    FIGURES,
+    HARD,
+    HARD_BLIND,
+    OWN,
+)
+from palpate_studies.study import Rendered, drawn
+from palpate_train.reports import confusion_plot
 from palpate_train.reports.formatting import estimate, exact_percent, seconds
 
 TITLES = {
@@ -33,22 +43,15 @@ Key = tuple[str, str]
 """Part and method."""
 
 
-def render(
-    summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = None
-) -> tuple[str, dict[str, str]]:
-    """The page (HTML) of the results, and its pictures (SVG) by name.
-
-    box_on_hard: the box's answers to T-HARD's sweeps, see pages.box_on_hard.
-    """
+def render(summary: Mapping[str, Any], box_on_hard: Mapping[str, Any] | None = None) -> Rendered:
+    """The page and its pictures. box_on_hard: the box's answers to T-HARD's sweeps, see
+    pages.box_on_hard."""
     rows = {(row["part"], row["method"]): row for row in summary["table"]}
     own = [method for method in OWN if ("hard", method) in rows]
-    drawn = pictures(summary)
-    page = html.render(
+    return drawn(
         "paper.html.j2",
-        TEMPLATES,
-        header=provenance.of(summary),
-        home=html.HOME,
-        pictures={name: html.picture(svg) for name, svg in drawn.items()},
+        summary,
+        pictures(summary),
         box_on_hard=box_on_hard,
         own=own,
         reference=BEST,
@@ -59,7 +62,7 @@ def render(
         loads=[row for part in ("hard", HARD_BLIND[1]) if (row := rows.get((part, LOADS)))],
         match=_match(rows),
         figures={
-            number: {"title": TITLES[part], "rows": _numbers(rows, part, (*FIVE, CNN))}
+            number: {"title": TITLES[part], "rows": _numbers(rows, part, (*BASELINES, CNN))}
             for part, number in FIGURES.items()
         },
         all_numbers={
@@ -69,18 +72,17 @@ def render(
         **_several(summary),
         **_run(summary),
     )
-    return page, drawn
 
 
 def pictures(summary: Mapping[str, Any]) -> dict[str, str]:
     """The confusions of the CNN, if it was run, and of the best classical method: Figs. 11, 12."""
     names, confusion = summary["results"][0]["materials"], summary["confusion"]
-    drawn = {}
+    made = {}
     if CNN in confusion:
         about = "Fig. 11: confusion of the CNN"
-        drawn["figure-11"] = confusion_plot.draw(np.array(confusion[CNN]), names, about, CONFUSION)
+        made["figure-11"] = confusion_plot.draw(np.array(confusion[CNN]), names, about, CONFUSION)
     about = f"Fig. 12: confusion of {BEST}"
-    return drawn | {"figure-12": confusion_plot.draw(np.array(confusion[BEST]), names, about)}
+    return made | {"figure-12": confusion_plot.draw(np.array(confusion[BEST]), names, about)}
 
 
 def _overview(rows: Mapping[Key, Row], method: str) -> dict[str, Any]:
@@ -110,7 +112,7 @@ def _gap(ours: Row, other: Row | None) -> str:
 
 def _match(rows: Mapping[Key, Row]) -> dict[str, Any]:
     """Differences between simulated and printed accuracies of the five classical methods."""
-    those = [rows[part, m] for part in FIGURES for m in FIVE if (part, m) in rows]
+    those = [rows[part, m] for part in FIGURES for m in BASELINES if (part, m) in rows]
     away = np.array([row["share"][0] - row["printed"] for row in those])
     off = [
         {"method": row["method"], "title": TITLES[row["part"]], "difference": difference}

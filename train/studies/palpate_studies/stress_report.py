@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from palpate.core.errors import FormatError
-from palpate_studies import TEMPLATES, stress_plots
+from palpate_studies import stress_plots
 from palpate_studies.method_names import about, plain_name, short_name
+from palpate_studies.study import Rendered, drawn
 from palpate_train.evaluate.robustness import POINTS, breaks_first
-from palpate_train.reports import html, provenance
 from palpate_train.reports.formatting import exact_percent, level
 
 Json = Mapping[str, Any]
@@ -21,8 +21,8 @@ SHOWN = 3
 """Corruptions of each method in the table of the first losses."""
 
 
-def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. name: of the file of results. Raises
+def render(result: Json, name: str = "stress") -> Rendered:
+    """The page and its pictures. name: of the file of results. Raises
     FormatError if no method has a result."""
     entries = {
         plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
@@ -33,14 +33,13 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         )
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]
-    paired = _columns(result, "pairs")
+    paired, (falls, broken) = _columns(result, "pairs"), first(curves[ours])
     pictures = {"curves": stress_plots.methods(curves)}
     pictures |= {"box": stress_plots.box(box)} if box else {}
-    page = html.render(
+    return drawn(
         "stress.html.j2",
-        TEMPLATES,
-        header=provenance.of(result),
-        home=html.HOME,
+        result,
+        pictures,
         r=result,
         name=name,
         command=command(result, name),
@@ -49,8 +48,7 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         ours=ours,
         points=exact_percent(POINTS).removesuffix(" %"),
         clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
-        pictures={name: html.picture(svg) for name, svg in pictures.items()},
-        headline=headline(curves[ours]),
+        headline={"first": falls, "broken": broken, "all": len(curves[ours])},
         first=[[name, *first(those)] for name, those in _with_box(curves, result["box"]).items()],
         most_wrong=most_wrong(box["wrong"]) if box else None,
         falls=fall_lines(curves, box),
@@ -58,7 +56,6 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
         refused=_refused(result["methods"]),
     )
-    return page, pictures
 
 
 def _with_box(curves: Json, box: Json) -> Json:
@@ -116,20 +113,11 @@ def _refused(methods: Json) -> Json:
     }
 
 
-def headline(curves: Json) -> Json:
-    """The corruptions that break a method first, and the number of all that do."""
-    falls, broken = first(curves)
-    return {"first": falls, "broken": broken, "all": len(curves)}
-
-
 def first(curves: Json) -> tuple[list[str], int]:
     """The corruptions that break a method first, in order, and the number of all that do."""
     broken = breaks_first(curves)
-    return [_fall(curves[name]) for name in broken[:SHOWN]], len(broken)
-
-
-def _fall(curve: Json) -> str:
-    return f"{curve['title']}: {level(curve, curve['falls'])}"
+    falls = [curves[name] for name in broken[:SHOWN]]
+    return [f"{of['title']}: {level(of, of['falls'])}" for of in falls], len(broken)
 
 
 def _of(curve: Json, i: int) -> tuple[float, float, float]:
@@ -165,11 +153,8 @@ def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
 def _cell(curve: Json | None) -> str:
     if curve is None:
         return ""
-    return (
-        f"> {level(curve, curve['severities'][-1])}"
-        if curve["falls"] is None
-        else level(curve, curve["falls"])
-    )
+    beyond = curve["falls"] is None
+    return "> " * beyond + level(curve, curve["severities"][-1] if beyond else curve["falls"])
 
 
 def missing(curves: Mapping[str, Json], ours: str) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,18 @@ from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate_studies import published
+from palpate_train.arguments import options
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.models.methods import FULL_EFFORT, Effort
+from palpate_train.reports import html, provenance
 
+TEMPLATES = Path(__file__).with_name("templates")
 DATA = Path("docs/data")
 """Folder of all results, from the project's folder."""
+Rendered = tuple[str, Mapping[str, str]]
+"""A page (HTML), and its pictures (SVG) by name."""
 NO_DATA = "real sweeps; name their folder with --data or PALPATE_DATA"
 
 
@@ -81,16 +86,19 @@ def results_file(name: str, folder: Path = DATA) -> Path:
 def add_out(command: argparse.ArgumentParser, name: str, *, kept: bool = True) -> None:
     """The option --out of the study `name`, and --kept."""
     file = results_file(name)
-    command.add_argument(
-        "--out",
-        type=outputs.file(".json"),
-        default=file,
-        metavar="FILE",
-        help=f"file of results ({file})",
-    )
-    if kept:
-        about = "train nothing, report what an earlier run has finished"
-        command.add_argument("--kept", action="store_true", help=about)
+    how = {"type": outputs.file(".json"), "default": file, "metavar": "FILE"}
+    rows: list[outputs.Row] = [("--out", f"file of results ({file})", how)]
+    about = "train nothing, report what an earlier run has finished"
+    rows += [("--kept", about, options.FLAG)] * kept
+    outputs.add_rows(command, *rows)
+
+
+def drawn(template: str, results: Any, pictures: Mapping[str, str], **data: Any) -> Rendered:
+    """The page that a template makes of `results`, with these pictures."""
+    shown = {name: html.picture(svg) for name, svg in pictures.items()}
+    about = provenance.of(results)
+    page = html.render(template, TEMPLATES, header=about, home=html.HOME, pictures=shown, **data)
+    return page, pictures
 
 
 def read(path: Path, *keys: str) -> Any:

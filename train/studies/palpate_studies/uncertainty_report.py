@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from palpate_studies import TEMPLATES
+from palpate_studies.study import Rendered, drawn
 from palpate_train.metrics.tolerances import KEPT
 from palpate_train.models.methods import PACKAGED, SHIPPED
-from palpate_train.reports import bundle_report, formatting, html, provenance
+from palpate_train.reports import bundle_report, formatting
 
 Json = Mapping[str, Any]
 ORIGIN = {
@@ -33,19 +33,16 @@ ORIGIN = {
 """The run: names in the results and on the page."""
 
 
-def render(figures: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name."""
+def render(figures: Json) -> Rendered:
+    """The page and its pictures."""
     after = figures["calibration"]["after"] | {"n": figures["calibration"]["n"]}
-    pictures = {"reliability": bundle_report.calibration(after)}
     (heat,), (rule,) = figures["calibration"]["temperature"], figures["early"]["rules"]
-    page = html.render(
+    return drawn(
         "uncertainty.html.j2",
-        TEMPLATES,
-        header=provenance.of(figures),
-        home=html.HOME,
+        figures,
+        {"reliability": bundle_report.calibration(after)},
         figures=figures,
         shipped=(PACKAGED, SHIPPED),
-        pictures={name: html.picture(svg) for name, svg in pictures.items()},
         tables=_tables(figures),
         worst=_worst(figures),
         temperature=f"{heat:.1f}",
@@ -54,7 +51,6 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         simulated=str(figures["set"]).startswith("sim:"),
         origin=[[text, figures[name]] for name, text in ORIGIN.items() if figures[name] != ""],
     )
-    return page, pictures
 
 
 def _worst(figures: Json) -> str:
@@ -67,18 +63,11 @@ def _worst(figures: Json) -> str:
 
 
 def _tables(figures: Json) -> dict[str, list[list[str]]]:
-    """The rows of each table."""
-    tables = {
-        "always": [
-            [f"{tenth} of 10", _share(p, "accuracy")]
-            for tenth, p in enumerate(figures["early"]["always"], 1)
-        ],
-    }
-    return tables | _unknown_tables(figures) if "unknown" in figures else tables
-
-
-def _unknown_tables(figures: Json) -> dict[str, list[list[str]]]:
-    """The rows of the tables about materials left out of training."""
+    """The rows of each table; the second is of materials left out of training."""
+    always = enumerate(figures["early"]["always"], 1)
+    tables = {"always": [[f"{tenth} of 10", _share(p, "accuracy")] for tenth, p in always]}
+    if "unknown" not in figures:
+        return tables
     of, mean = figures["unknown"], figures["unknown"]["mean"]
     shares = ("false_known", "kept", "auroc", "false_known_at_95")
     rows = [
@@ -89,9 +78,8 @@ def _unknown_tables(figures: Json) -> dict[str, list[list[str]]]:
         ]
         for name, m in of["materials"].items()
     ]
-    return {
-        "unknown": [*rows, ["mean", *(formatting.percent(mean[k]) for k in shares), ""]],
-    }
+    means = ["mean", *(formatting.percent(mean[k]) for k in shares), ""]
+    return tables | {"unknown": [*rows, means]}
 
 
 def _share(of: Json, name: str) -> str:
