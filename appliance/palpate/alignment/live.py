@@ -1,15 +1,15 @@
-"""Shows a skin on displays, five times a second, and makes the views of `palpate skin align`."""
+"""Shows a skin on displays, five times a second, as a page or a line a second, and makes the views
+of `palpate skin align`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TextIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.alignment.view import Display, View
 from palpate.answer.contact import IN_PLACE, ContactPositions, Point, advice, centre
 from palpate.answer.unloaded import UnloadedTracker
 from palpate.bundle.bundle import Bundle
@@ -20,14 +20,94 @@ from palpate.io.sensor import Sensor
 
 Shown = TypeVar("Shown")
 Seen = TypeVar("Seen", covariant=True)
-VIEW_NS = 200_000_000
-"""Time between two Views."""
+Given = TypeVar("Given", contravariant=True)
+VIEW_NS, LINE_NS = 200_000_000, 1_000_000_000
+"""Time between two Views, and between two lines."""
 SPAN_S = 0.3
 """Length of the latest signal that is averaged. It is long compared with the vibrations of a pulse
 or a robot's controller."""
 NO_BUNDLE = "none for this skin"
 SHOWN = 10
 """Initial value of the strongest load shown, in multiples of the contact threshold."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The contact on the skin at one moment, and advice for the person.
+
+    number: counts Views from 1.
+    source: as in sentences ("usb", "sim").
+    skin: its state (PROTOCOL.md).
+    state: "no-skin", "wait", "lift", "no-contact", "no-positions", "off" or "in-place".
+    message: the state in words.
+    hint: advice for the person.
+    load: raw counts above the unloaded skin, [rows][columns]; empty before the first frames.
+    full: load that is shown as the strongest.
+    centre: centre of the contact, mm from the centre of taxel 1.1 (in taxels without `contact`).
+    nearest: the nearest trained position, in the same unit.
+    contact: contact positions in training, None if unknown.
+    fingertip: setting `skin.fingertip`.
+    load_unit: unit of the load, "" for raw counts.
+    """
+
+    number: int
+    source: str
+    bundle: str
+    skin: str
+    state: str
+    message: str
+    hint: str
+    shape: tuple[int, int]
+    load: tuple[tuple[float, ...], ...] = ()
+    full: float = 1.0
+    centre: Point | None = None
+    nearest: Point | None = None
+    contact: ContactPositions | None = None
+    fingertip: str = ""
+    load_unit: str = ""
+
+    @property
+    def origin(self) -> str:
+        """A note that the skin is simulated or replayed, "" for a real skin."""
+        return {"usb": "", "replay": "REPLAYED"}.get(self.source, "SIMULATED")
+
+    @property
+    def unit(self) -> str:
+        """Unit of centre and nearest."""
+        return "mm" if self.contact else "taxels"
+
+    def json(self) -> dict[str, Any]:
+        """The View as the page reads it."""
+        return asdict(self)
+
+
+class Display(Protocol[Given]):
+    """Shows one view after another."""
+
+    def show(self, view: Given) -> None:
+        """Show `view` instead of the view before."""
+
+
+class LinePrinter(Generic[Shown]):
+    """Prints what it is shown on `out`, at most once a second. line: makes the line."""
+
+    def __init__(self, out: TextIO, clock: Clock, line: Callable[[Shown], str]) -> None:
+        self._out, self._clock, self._line = out, clock, line
+        self._next_ns = 0
+
+    def show(self, view: Shown) -> None:
+        """Print `view`, unless a line was printed within the last second."""
+        if (now_ns := self._clock.now_ns()) >= self._next_ns:
+            self._next_ns = now_ns + LINE_NS
+            print(self._line(view), file=self._out, flush=True)
+
+
+def line(view: View) -> str:
+    """A View in one line that begins with the message."""
+    at = ""
+    if view.centre is not None:
+        at = f"  centre row {view.centre[0]:.1f} column {view.centre[1]:.1f} {view.unit}"
+    return f"{view.origin and f'{view.origin}  '}{view.message}{at}  ({view.hint})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -164,7 +164,6 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 def run_show(args: argparse.Namespace) -> int:
     """Show the skin live, a line a second and on a page, until Ctrl-C."""
     from palpate.alignment import live
-    from palpate.alignment.view import LinePrinter
     from palpate.tools import skin_monitor
 
     devices = open_devices(args, None)
@@ -175,7 +174,7 @@ def run_show(args: argparse.Namespace) -> int:
     stopped = StopFlag()
     with ExitStack() as stack:
         pages = local_page("skin.html", args.web, stack)
-        lines = LinePrinter(sys.stdout, devices.clock, skin_monitor.line)
+        lines = live.LinePrinter(sys.stdout, devices.clock, skin_monitor.line)
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
         names = settings.skin.profile, devices.source, skins.profile(settings).unit
         monitor = skin_monitor.SkinMonitor(format, names)
@@ -186,7 +185,6 @@ def run_show(args: argparse.Namespace) -> int:
 def run_align(args: argparse.Namespace) -> int:
     """Show where the contact lies, until Ctrl-C."""
     from palpate.alignment import live
-    from palpate.alignment.view import LinePrinter, line
 
     if args.sim == "skin":  # a sweep lifts the finger for a tenth of a second; here it rests
         args.sim = "rest"
@@ -197,7 +195,7 @@ def run_align(args: argparse.Namespace) -> int:
     stopped = StopFlag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = local_page("watch.html", args.web, stack)
-        lines = LinePrinter(sys.stdout, devices.clock, line)
+        lines = live.LinePrinter(sys.stdout, devices.clock, live.line)
         sensor = stack.enter_context(closing(skins.sensor(settings, expected.format, devices)))
         tracker = live.ContactTracker(expected, devices.source)
         live.run(sensor, tracker, [lines, *pages], devices.clock, stopped)

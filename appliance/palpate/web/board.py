@@ -44,7 +44,7 @@ class PageBoard:
     health, state: unchanged. box: whether there is a feed. verdict: with rounded `scores`, the
     `name` of its label, the `reason` for a sweep without a label; `moved` is null in place. minute:
     frames and lost frames of the last minute. signal: a sweep's window is available. view: see
-    alignment.view. note: another bundle or program.
+    alignment.live. note: another bundle or program.
     """
 
     def __init__(self, publish: Publish, finger: str = "") -> None:

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 from palpate.alignment import live
-from palpate.alignment.live import ContactTracker, Expected
-from palpate.alignment.view import LinePrinter, View, line
+from palpate.alignment.live import ContactTracker, Expected, LinePrinter, View, line
 from palpate.answer.contact import ContactPositions
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
@@ -220,7 +219,7 @@ def test_a_view_is_shown_five_times_a_second_and_printed_once(model, monkeypatch
     for line_ns, lines in ((0, range(24, 27)), (SECOND, range(5, 7))):
         simulated, out = resting(), io.StringIO()
         end_ns = simulated.clock.now_ns() + 5 * SECOND
-        monkeypatch.setattr("palpate.alignment.view.LINE_NS", line_ns)
+        monkeypatch.setattr("palpate.alignment.live.LINE_NS", line_ns)
         settings = simulated.wire(config.load(None, [], site=NO_SITE))
         printer = LinePrinter(out, simulated.clock, line)
         stopped = lambda: simulated.clock.now_ns() >= end_ns  # noqa: B023, E731

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from palpate.alignment.view import View
+from palpate.alignment.live import View
 from palpate.answer.contact import ContactPositions
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Manifest

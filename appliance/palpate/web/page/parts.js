@@ -107,7 +107,7 @@ export function percentAtMost(p) { return percent(Math.floor(1000 * p + 1e-6) / 
 
 export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 
-/* A load in text, as `figure` of appliance/palpate/alignment/view.py. */
+/* A load in text, as `figure` of appliance/palpate/alignment/live.py. */
 export function figure(value, full, unit) { return value.toFixed(unit === "N" ? 2 : !unit || full >= 100 ? 0 : full >= 10 ? 1 : 2); }
 
 export function count(n) { return n.toLocaleString("en"); }

@@ -35,7 +35,7 @@ export function shades() {
   };
 }
 
-/* Draws views (appliance/palpate/alignment/view.py) into an element. */
+/* Draws views (appliance/palpate/alignment/live.py) into an element. */
 export class SkinPicture {
   /* pointed: [row, column] of the taxel that was pointed at last, or touched. */
   constructor(parent) { this.parent = parent; this.drawn = ""; this.pointed = null; }
