@@ -74,7 +74,7 @@ def answers(
     """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
     five. lost: frames of each sweep that never arrived. alone: whether to ask the network alone,
     too."""
-    given = bundle_score.outcomes_of(box, sweeps, lost)
+    given = bundle_score.outcomes_of(box, sweeps, lost=lost)
     given["correct"] = given.pop("right")
     if alone:
         labels, truth = np.array(box.bundle.manifest.labels), np.array(sweeps.materials)

@@ -161,7 +161,7 @@ def counted(bundle: Bundle, given: Iterable[Given]) -> dict[str, Counts]:
     """The answers of the box with this bundle, by the kind of the sweeps."""
     box, found = Classifier(bundle, SystemClock(), slides=False), dict[str, Counts]()
     for one in given:
-        became = bundle_score.outcomes_of(box, one.sweeps, one.lost)
+        became = bundle_score.outcomes_of(box, one.sweeps, lost=one.lost)
         right, wrong = int(became["right"].sum()), int(became["wrong"].sum())
         counts = Counts(0, right + wrong) if one.kind == NONE else Counts(right, wrong)
         found[one.kind] = found.get(one.kind, Counts()) + counts

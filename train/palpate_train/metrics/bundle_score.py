@@ -77,11 +77,13 @@ def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answer
     return Answers(labels, ok, np.where(decided, fused, UNKNOWN), logits.argmax(1))
 
 
-def outcomes_of(classifier: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
-    """The outcome of each sweep, as score.outcomes. lost: frames of each that never arrived."""
+def outcomes_of(
+    classifier: Classifier, sweeps: Dataset, *, fused: bool = False, lost: int = 0
+) -> dict[str, Array]:
+    """The outcome of each sweep, as score.outcomes. fused, lost: as for `labels_of`."""
     known = classifier.bundle.manifest.labels
     numbers = [known.index(m) if m in known else len(known) for m in sweeps.materials]
-    named, sure = labels_of(classifier, sweeps, lost=lost)
+    named, sure = labels_of(classifier, sweeps, fused=fused, lost=lost)
     return outcomes(named, sure, np.array(numbers)[sweeps.labels])
 
 
@@ -253,16 +255,11 @@ def _clusters(sweeps: Dataset) -> tuple[Array | None, str]:
 
 def _recordings(classifier: Classifier, sweeps: Dataset) -> Array | None:
     """Whether the last fused answer to each recording is right, bool [G]; None if every recording
-    has one sweep."""
-    values, member = np.unique(sweeps.group("recording"), return_inverse=True)
-    if len(values) == len(sweeps):
+    has one sweep. An unknown sweep is not fused and keeps the last answer."""
+    first = np.unique(sweeps.group("recording"), return_index=True)[1]
+    if len(first) == len(sweeps):
         return None
-    right = np.zeros(len(values), bool)
-    for i, verdict in verdicts(classifier, sweeps, fused=True):
-        if verdict.label:  # an unknown sweep is not fused and keeps the last answer
-            right[member[i]] = (
-                verdict.status is Status.OK and verdict.label == sweeps.materials[sweeps.labels[i]]
-            )
+    right: Array = outcomes_of(classifier, sweeps, fused=True)["right"][first]
     return right
 
 
