@@ -10,9 +10,10 @@ from palpate.core.errors import FormatError
 from palpate_studies import certainty, uncertainty_report
 from palpate_train.answer.calibrate import fit_calibration
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate import uncertainty, uncertainty_cases
+from palpate_train.evaluate import uncertainty
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case
+from palpate_train.evaluate.fold import keep, kept
+from palpate_train.evaluate.uncertainty import FIELDS, NONE_LEFT_OUT, Case
 from palpate_train.models.methods import Effort
 from tests.factories.calibration_inputs import plain_inputs
 
@@ -174,10 +175,9 @@ def test_methods_without_tenths_are_refused():
 def test_a_case_lost_on_the_way_is_trained_again(tmp_path):
     """A broken cache file is not taken for a Case."""
     path = tmp_path / "x.case.npz"
-    uncertainty_cases._save(case(2), path)
-    kept = uncertainty_cases._load(path)
-    assert kept
-    assert kept.left_out == 2
-    assert np.array_equal(kept.seen, case(2).seen)
+    keep(path, vars(case(2)))
+    found = Case(**(kept(path, FIELDS) or {}))
+    assert found.left_out == 2
+    assert np.array_equal(found.seen, case(2).seen)
     path.write_bytes(path.read_bytes()[:100])
-    assert uncertainty_cases._load(path) is None
+    assert kept(path, FIELDS) is None

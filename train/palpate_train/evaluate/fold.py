@@ -12,7 +12,7 @@ import io
 import json
 import time
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -118,27 +118,37 @@ class Fold:
 
     def save(self, path: Path) -> None:
         """Write the fold, whole or not at all."""
-        packed = io.BytesIO()
-        arrays: dict[str, Any] = {k: np.asarray(getattr(self, k)) for k in PLAIN}
-        arrays |= {FORM + name: logits for name, logits in self.forms.items()}
-        np.savez(packed, **arrays)
-        put(path, packed.getvalue(), parents=True)
+        forms = {FORM + name: logits for name, logits in self.forms.items()}
+        keep(path, {name: getattr(self, name) for name in PLAIN} | forms)
 
     @classmethod
     def load(cls, path: Path) -> Fold | None:
         """Read a fold that `save` wrote; None if the file is missing or cannot be read."""
-        try:
-            with np.load(path, allow_pickle=False) as z:
-                arrays = {k: z[k] for k in PLAIN}
-                forms = {k.removeprefix(FORM): z[k] for k in z.files if k.startswith(FORM)}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        if (found := kept(path, PLAIN)) is None:
             return None
-        plain = {k: v.item() if v.ndim == 0 else v for k, v in arrays.items()}
-        return cls(**plain, forms=forms)
+        forms = {k.removeprefix(FORM): v for k, v in found.items() if k.startswith(FORM)}
+        return cls(**{name: found[name] for name in PLAIN}, forms=forms)
 
 
 FORM = "form "
 PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
+
+
+def keep(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays, numbers and texts as one .npz, whole or not at all."""
+    packed, plain = io.BytesIO(), {name: np.asarray(value) for name, value in arrays.items()}
+    np.savez(packed, **plain)  # type: ignore[arg-type]
+    put(path, packed.getvalue(), parents=True)
+
+
+def kept(path: Path, names: Iterable[str]) -> dict[str, Any] | None:
+    """What `keep` wrote, with all `names`; None if the file is missing or cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            found = {name: v.item() if v.ndim == 0 else v for name, v in z.items()}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+    return found if found.keys() >= set(names) else None
 
 
 def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:

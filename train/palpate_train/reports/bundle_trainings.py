@@ -20,7 +20,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, uncertainty
 from palpate_train.evaluate.evaluate import Plan, Result, Where
 from palpate_train.evaluate.fold import Fold
-from palpate_train.evaluate.uncertainty_cases import Case
+from palpate_train.evaluate.uncertainty import Case
 from palpate_train.models import methods
 from palpate_train.models.methods import SHIPPED, Effort
 from palpate_train.models.recipe.fitted import Fit

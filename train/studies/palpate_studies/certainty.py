@@ -20,7 +20,7 @@ from palpate_train.answer.fit_early import decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.uncertainty_cases import (
+from palpate_train.evaluate.uncertainty import (
     NONE_LEFT_OUT,
     Case,
     CaseTask,
