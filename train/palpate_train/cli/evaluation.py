@@ -17,7 +17,7 @@ from palpate_train.arguments.options import EFFORT, FLAG, WHERE, path
 from palpate_train.arguments.program import Add
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, set_warnings, trivial
-from palpate_train.export import box_answers
+from palpate_train.export import quantized_bundle
 from palpate_train.models import methods
 
 
@@ -78,7 +78,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
         )
     seeds = options.seeds(args)
     # the box sees raw counts
-    box = None if args.remove_means or args.label_alone else box_answers.answers
+    box = None if args.remove_means or args.label_alone else quantized_bundle.box_answers
     protocols, log = tuple(args.protocols), options.Log()
     plan = evaluate.Plan(names, protocols, seeds, args.remove_means, effort, args.each, box)
     results: list[dict[str, Any]] = []

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Unpack
 
 import numpy as np
@@ -13,16 +14,20 @@ import onnx
 from numpy.typing import NDArray
 
 from palpate.bundle import bundle
+from palpate.core import provenance
+from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
+from palpate.inference.classifier import Classifier
 from palpate_train.answer.rules import ALL
 from palpate_train.data import extras
+from palpate_train.data.sets import Dataset
 from palpate_train.export import fit_rules, pack
 from palpate_train.export.contents import Content, ExportRefused, content_of
 from palpate_train.export.pack import PackOptions
-from palpate_train.metrics import tolerances
+from palpate_train.metrics import bundle_score, tolerances
 from palpate_train.models.method_fit import MethodFit
-from palpate_train.models.methods import model_inputs
-from palpate_train.models.recipe.fitted import Fit, finished
+from palpate_train.models.methods import Model, model_inputs
+from palpate_train.models.recipe.fitted import Fit, FittedModel, finished
 from palpate_train.onnx_tools import parity
 from palpate_train.onnx_tools.graph_builder import run, with_head
 from palpate_train.onnx_tools.parity import Parity
@@ -164,6 +169,28 @@ def check(found: Parity) -> None:
         raise ExportRefused(
             f"int8 {why}; drop training sweeps that are unlike all others, or record more"
         )
+
+
+def box_answers(model: Model, sweeps: Dataset) -> tuple[Array, Array] | None:
+    """The box's answers to `sweeps`, as `export` and `score` give them, see fold.AsTheBox; None for
+    a model that is not a fit. Raises FormatError or BundleError if export refuses the model."""
+    if not isinstance(model, FittedModel):
+        return None
+    own = model.fit.train.materials
+    with TemporaryDirectory() as folder:
+        pack_fold(model.fit, target := Path(folder) / "bundle")
+        classifier = Classifier(bundle.load(target), SystemClock())
+        found, sure = bundle_score.labels_of(classifier, sweeps)
+    labels = [sweeps.materials.index(own[k]) if k >= 0 else int(k) for k in found]
+    return np.array(labels, int), sure
+
+
+def pack_fold(fit: Fit, target: Path) -> None:
+    """Calibrate `fit` and export it with all rules of the answer. Its materials get names that any
+    bundle may have: they change no answer. Raises FormatError or BundleError if export refuses."""
+    names = tuple(f"m{number}" for number in range(len(fit.train.materials)))
+    sides = {side: replace(getattr(fit, side), materials=names) for side in ("train", "held")}
+    export(finished(replace(fit, **sides)), target, "fold", "1", provenance.commit(), proven=False)
 
 
 def text(manifest: bundle.Manifest) -> str:

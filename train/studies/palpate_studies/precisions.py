@@ -13,7 +13,7 @@ from palpate_studies import cost
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import fingerprint
-from palpate_train.export import box_answers, contents, pack
+from palpate_train.export import contents, pack, quantized_bundle
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import Method
@@ -82,7 +82,7 @@ def _packed_forms(
     """Each precision packed in a folder of its own, and a model of ours as it ships."""
     model, made = MethodFit.of(method, sweeps, seed)
     if isinstance(model, FittedModel):
-        box_answers.pack(model.fit, work / WHOLE)
+        quantized_bundle.pack_fold(model.fit, work / WHOLE)
     content = contents.content_of(made)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
