@@ -18,7 +18,9 @@ class SlowDisk(Observer):
     def __init__(self) -> None:
         self._work: list[tuple[Callable[[], Any], Callable[[Any], object]]] = []
 
-    def __call__(self, work: Callable[[], Any], done: Callable[[Any], object]) -> bool:
+    def __call__(
+        self, work: Callable[[], Any], done: Callable[[Any], object] = lambda result: None
+    ) -> bool:
         self._work.append((work, done))
         return True
 

@@ -147,7 +147,7 @@ class Shadow(Observer):
         classifier: Callable[[Bundle], Classifier],
         disk: DiskWork | None = None,
     ) -> None:
-        self._disk, self._busy = disk or AtOnce(), False
+        self._disk = disk or AtOnce()
         if candidate.format != current.format:
             raise BundleError(
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service "
@@ -163,7 +163,6 @@ class Shadow(Observer):
         self._log = TroubleLog(
             f"shadow: {folder} cannot be written", "make room there; classifying goes on"
         )
-        self._waiting: list[tuple[Sweep, Verdict, Mapping[str, Any]]] = []
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
         try:
             self._sweeps = SweepFolder(folder, current.format)
@@ -182,7 +181,7 @@ class Shadow(Observer):
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Classify a sweep that has a window with the candidate. If the answers differ, the sweep
-        is kept in a later turn."""
+        is kept."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
         tare = np.asarray(circumstances["tare"], np.float64)
@@ -209,29 +208,32 @@ class Shadow(Observer):
             self.agreement.later += 1
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
             self._due_ns = begin_ns
-            if self.agreement.kept + len(self._waiting) < KEPT:
-                self._waiting.append(
-                    (sweep, verdict, {**circumstances, "candidate": other.as_dict()})
-                )
+            if self.agreement.kept < KEPT:
+                about = {**circumstances, "candidate": other.as_dict()}
+                kept = partial(self._sweeps.put, sweep, verdict, about)
+                self.agreement.kept += 1
+                if not self._disk(lambda: self._log.attempt(kept), self._written):
+                    self._written(False)
 
     def turn(self, health: Health) -> None:
-        """At the end of a turn: write one file that is due, unless a sweep is open."""
-        if health.sweeping or self._busy:
-            return
-        if self._waiting:
-            self._beside(partial(self._sweeps.put, *self._waiting[0]), of_first=True)
-        elif not self._waiting and self._clock.now_ns() >= self._due_ns:
-            self._beside(self._writing())
+        """At the end of a turn: write the counts if they are due, unless a sweep is open."""
+        if not health.sweeping and self._clock.now_ns() >= self._due_ns:
+            self._due_ns = NEVER_NS
+            if self._clock.now_ns() >= self._settled_ns:
+                self.agreement.starts = 0
+            counts = partial(storage.put, self._sweeps.folder / FILE, self.agreement.json())
+            self._disk(lambda: self._log.attempt(counts))
 
     def stopping(self) -> None:
-        """At an orderly end of the loop: write all pending files, and do not count this start."""
+        """At an orderly end of the loop: write the counts, without this start."""
         self._disk.settle()
         self.agreement.starts = 0
-        while self._waiting:
-            self._log.attempt(partial(self._sweeps.put, *self._waiting.pop(0)))
-            self.agreement.kept = len(self._sweeps.numbers)
-        self._log.attempt(self._writing())
+        counts = self.agreement.json()
+        self._log.attempt(partial(storage.put, self._sweeps.folder / FILE, counts))
         self._sweeps.close()
+
+    def _written(self, succeeded: bool) -> None:
+        self.agreement.kept -= not succeeded
 
     def _begin(self, candidate: str, current: str) -> Agreement:
         """The agreement to continue, or a new agreement, with this start counted."""
@@ -250,7 +252,7 @@ class Shadow(Observer):
                 f"the program has died {found.starts} times while candidate {candidate} ran beside "
                 f"it; remove {self._sweeps.folder / FILE} to try again"
             )
-        found.starts += 1
+        found.starts, found.kept = found.starts + 1, len(self._sweeps.numbers)
         storage.put(self._sweeps.folder / FILE, found.json())
         return found
 
@@ -268,21 +270,3 @@ class Shadow(Observer):
                 f"shadow: candidate {self.agreement.candidate} was stopped, it failed {FAILURES} "
                 f"times in a row: {why}; classifying goes on"
             )
-
-    def _beside(self, act: Callable[[], object], *, of_first: bool = False) -> None:
-        """Do `act` next to the loop, if that is possible now. of_first: it keeps the first of the
-        waiting sweeps, which waits no longer then."""
-
-        def done(succeeded: bool) -> None:
-            self._busy, self.agreement.kept = False, len(self._sweeps.numbers)
-            del self._waiting[:of_first]
-
-        self._busy = True
-        self._busy = self._disk(lambda: self._log.attempt(act), done) and self._busy
-
-    def _writing(self) -> Callable[[], None]:
-        """The write of the counts as they are now."""
-        self._due_ns = NEVER_NS
-        if self._clock.now_ns() >= self._settled_ns:
-            self.agreement.starts = 0
-        return partial(storage.put, self._sweeps.folder / FILE, self.agreement.json())

@@ -63,10 +63,9 @@ class Trial(Observer):
         self._store, self._sha, self._title = store, sha, title
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
-        self._done = False  # the commit has ended the trial
         self._last_ns: int | None = None  # time of the last turn if it had frames
         self._worked, self._noted_ns = False, self._streamed_ns  # progress up to the last write
-        self._next_ns, self._over, self._stale, self._busy = 0, False, False, False
+        self._next_ns, self._over, self._stale = 0, False, False
         self._log = TroubleLog(f"trial of {title} cannot be recorded", "it is tried again")
 
     @property
@@ -98,15 +97,14 @@ class Trial(Observer):
             if self._streamed_ns - self._noted_ns >= WORKED_S * 1e9:
                 self._worked = self._stale = True
         self._last_ns = health.time_ns if health.streams else None
-        if health.time_ns >= self._next_ns and not self._busy:
+        if health.time_ns >= self._next_ns:
             self._record(health)
 
     def stopping(self) -> None:
         """At an orderly end of the program: do not count this start."""
         self.disk.settle()
-        if not self._over and self._counted:
+        if not self._over:
             self._log.attempt(self._note(False), ERRORS)
-            self._counted = False
 
     def __enter__(self) -> Trial:
         return self
@@ -124,27 +122,22 @@ class Trial(Observer):
             self.stopping()
 
     def _record(self, health: Health) -> None:
-        """Record or commit if needed. A commit waits until no sweep is open."""
-        counted = health.streams
+        """Record or commit if needed, again after a failure. A commit waits until no sweep is
+        open."""
         if self._store.goal.reached(self._sweeps, self._streamed_ns / 1e9):
-            if not health.sweeping:
-                self._write(health, self._commit, self._end)
-        elif counted != self._counted or self._stale:
-            self._stale, self._noted_ns = False, self._streamed_ns
-            note = self._note(counted)
-            self._write(health, note, partial(setattr, self, "_counted", counted))
-
-    def _write(self, health: Health, act: Callable[[], object], done: Callable[[], object]) -> None:
-        """Write to the store; `done` follows a success, another attempt a failure."""
+            if health.sweeping:
+                return
+            self._over, act = True, self._commit
+        elif health.streams != self._counted or self._stale:
+            self._stale, self._noted_ns, self._counted = False, self._streamed_ns, health.streams
+            act = self._note(self._counted)
+        else:
+            return
 
         def written(succeeded: bool) -> None:
-            self._busy = False
-            if succeeded:
-                done()
-            else:
-                self._stale, self._next_ns = True, health.time_ns + RETRY_NS
+            if not succeeded:
+                self._over, self._stale, self._next_ns = False, True, health.time_ns + RETRY_NS
 
-        self._busy = True
         if not self.disk(lambda: self._log.attempt(act, ERRORS), written):
             written(False)
 
@@ -155,9 +148,5 @@ class Trial(Observer):
         return partial(self._store.note, self._sha, progress, counted=counts)
 
     def _commit(self) -> None:
-        self._done = self._store.commit(self._sha, 0.0)
-
-    def _end(self) -> None:
-        self._over = True
-        if self._done:
+        if self._store.commit(self._sha, 0.0):
             log.info(f"{self._title} has passed its trial and is committed")
