@@ -124,10 +124,11 @@ class Trial(Observer):
     def _record(self, health: Health) -> None:
         """Record or commit if needed, again after a failure. A commit waits until no sweep is
         open."""
+        act: Callable[[], object] = self._commit
         if self._store.goal.reached(self._sweeps, self._streamed_ns / 1e9):
             if health.sweeping:
                 return
-            self._over, act = True, self._commit
+            self._over = True
         elif health.streams != self._counted or self._stale:
             self._stale, self._noted_ns, self._counted = False, self._streamed_ns, health.streams
             act = self._note(self._counted)

@@ -103,33 +103,31 @@ def _numbers(
     end = begin + (len(data) - begin) // size * size if length is None else begin + length
     if end > len(data):
         return None
-    raw = np.frombuffer(data, np.uint8, end - begin, begin)
+    raw = np.frombuffer(data, np.uint8, end - begin, begin)[None]
+    numbers = wire_numbers.read(raw, p.number, p.byte_order)[0] if end > begin else raw[0]
     if not p.zeros:
-        return wire_numbers.read(raw[None], p.number, p.byte_order)[0], end
-    numbers = wire_numbers.read(raw[None], p.number, p.byte_order)[0] if len(raw) else raw
-    values, used = _expanded(numbers, count if length is None else len(data) * 256)
+        return numbers, end
+    most = count if length is None else len(data) * 256
+    values, used = _expanded(numbers.tolist(), most)
     if length is None and len(values) < count:
         return None
     if len(values) > p.numbers or (length is not None and used * size != length):
         return "a run of zeros is too long; correct zeros, rows or cols"
-    return values, begin + used * size
+    return np.array(values, numbers.dtype), begin + used * size
 
 
-def _expanded(numbers: NDArray[Any], most: int) -> tuple[NDArray[Any], int]:
+def _expanded(numbers: list[int], most: int) -> tuple[list[int], int]:
     """The numbers with their runs of zeros, at least `most` if there are so many, and how many were
     used."""
-    runs: list[NDArray[Any]] = []
-    at = total = 0
-    zeros = np.flatnonzero(numbers == 0)
-    while at < len(numbers) and total < most:
-        following = zeros[np.searchsorted(zeros, at) :]
-        stop = int(following[0]) if len(following) else len(numbers)
-        stop = min(stop, at + most - total)
-        run = numbers[at:stop]
-        if stop == at:
-            if at + 1 == len(numbers):
-                break
-            run, stop = np.zeros(min(max(0, int(numbers[at + 1])), most + 1), numbers.dtype), at + 2
-        runs.append(run)
-        at, total = stop, total + len(run)
-    return np.concatenate(runs) if runs else numbers[:0], at
+    values: list[int] = []
+    at = 0
+    while at < len(numbers) and len(values) < most:
+        if numbers[at]:
+            values.append(numbers[at])
+            at += 1
+        elif at + 1 < len(numbers):
+            values += [0] * min(numbers[at + 1], most + 1)
+            at += 2
+        else:
+            break
+    return values, at
