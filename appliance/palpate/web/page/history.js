@@ -1,7 +1,7 @@
 /* How many verdicts of each material and status there were in a shift, today or in 30 days, the trend of those without an answer, and
    all of them as a CSV file. The box's program counts them (appliance/palpate/web/history.py). */
 
-import {byId, clock, common, count, fill, made, percent, put} from "./parts.js";
+import {asked, byId, changed, clock, common, count, fill, made, percent, put} from "./parts.js";
 import {trend} from "./plots.js";
 
 const PERIODS = {0: "this shift", 1: "today", 30: "30 days"}, EVERY_MS = 30_000, SOON_MS = 1500;
@@ -15,12 +15,8 @@ async function ask(which, again) {
   const before = found[which], now = Date.now();
   if (before && (before.asking || now - before.at < SOON_MS || (before.at > newest + SOON_MS && now - before.at < EVERY_MS))) return;
   found[which] = {...before, at: now, asking: true};
-  let got = {};
-  try {
-    const answer = await fetch(`history/${which}`, {cache: "no-store"});
-    if (answer.ok) got = await answer.json();
-  } catch { /* what was there before stays; the head says that there is no connection */ }
-  found[which] = {...before, ...got, why: got.why, at: now, asking: false};
+  const got = await asked(`history/${which}`); // without an answer, what was there before stays
+  found[which] = {...before, ...got, why: got?.why, at: now, asking: false};
   again();
 }
 
@@ -66,13 +62,11 @@ export function sentence(of) {
 }
 
 function drawOne(where, of, shown) {
-  const one = byId(where);
-  const text = JSON.stringify((of?.counts ?? []).map(([status, label, n]) => [status, label && shown(label), n])); // names may come later
+  const one = byId(where), counts = of?.counts ?? [];
   put(`${where}-counted`, sentence(of));
   put(`${where}-kept`, !of?.counts ? "" : of.kept_s ? "Counted since the page's program was started. To keep 90 days: sudo systemctl enable --now palpate-bridge@memory" : "");
-  if (one.dataset.shown === text) return;
-  one.dataset.shown = text;
-  drawTable(one.querySelector("table"), of?.counts ?? [], shown);
+  const content = counts.map(([status, label, n]) => [status, label && shown(label), n]); // names may come later
+  if (changed(one, content)) drawTable(one.querySelector("table"), counts, shown);
 }
 
 /* What is known of this shift. heardAt: when the last verdict came, in ms. */
@@ -102,7 +96,7 @@ export function drawHistory(heardAt, shown, again) {
 export function listenToHistory(again) {
   for (const [days, words] of Object.entries(PERIODS)) {
     const button = made("button", "", words[0].toUpperCase() + words.slice(1), byId("periods"));
-    Object.assign(button, {type: "button"}).dataset.period = days;
+    button.dataset.period = days;
     button.addEventListener("click", () => {
       period = Number(days);
       again();

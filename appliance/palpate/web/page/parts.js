@@ -35,8 +35,41 @@ export function made(name, classes, text, parent) {
   const one = document.createElement(name);
   if (classes) one.className = classes;
   if (text !== undefined) one.textContent = text;
+  if (name === "button") one.type = "button";
   parent?.append(one);
   return one;
+}
+
+/* Whether an element shows other content than this, and so is to be drawn again. */
+export function changed(element, content) {
+  const before = element.dataset.shown;
+  return before !== (element.dataset.shown = JSON.stringify(content));
+}
+
+/* Calls page.draw() where page.dirty was set, once a second, and where the window or its colours change; and page.each() in every frame. */
+export function redraw(page) {
+  const again = () => { page.dirty = true; }, tick = () => {
+    if (page.dirty) {
+      page.dirty = false;
+      page.draw();
+    }
+    page.each?.();
+    requestAnimationFrame(tick);
+  };
+  addEventListener("resize", again);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
+  setInterval(again, 1000);
+  tick();
+}
+
+/* What the box answers, null without an answer: the head says that there is no connection, and it is asked again when there is one. */
+export async function asked(path) {
+  try {
+    const answer = await fetch(path, {cache: "no-store"});
+    return answer.ok ? await answer.json() : null;
+  } catch {
+    return null;
+  }
 }
 
 /* Draws the head of a page. state: of the skin, in words; fine: whether it streams. source: of the frames, if known. why: why

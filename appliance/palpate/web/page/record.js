@@ -1,12 +1,12 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
-import {byId, enable, fill, made, mark, put} from "./parts.js";
-import {signal, spectrogram} from "./plots.js";
-import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since} from "./recording.js";
+import {byId, changed, enable, fill, made, put} from "./parts.js";
+import {spectrogram} from "./plots.js";
+import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen} from "./recording.js";
 import {SkinPicture} from "./skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
-let view, drawn = {}, table = "";
+let view, drawn = {};
 
 /* A material by the name that people read. */
 function shown(material) { return seen.recording?.displays?.[material] ?? material; }
@@ -38,9 +38,8 @@ function drawCounts() {
   const {counts, material, position, target} = recording, held = new Map(counts.map(([m, p, n]) => [JSON.stringify([m, p]), n]));
   const materials = sorted([...counts.map((one) => one[0]), ...(material ? [material] : [])]);
   const positions = sorted([...counts.map((one) => one[1]), ...(material ? [position] : [])]);
-  const content = JSON.stringify([materials, positions, recording.displays]), box = byId("counts");
-  if (content !== table) {
-    table = content;
+  const box = byId("counts");
+  if (changed(box, [materials, positions, recording.displays])) {
     const head = made("tr"), body = materials.map((name) => {
       const row = made("tr");
       made("th", "", shown(name), row).scope = "row";
@@ -58,7 +57,6 @@ function drawCounts() {
   for (const field of box.querySelectorAll("button")) {
     const {material: m, position: p} = field.dataset, n = held.get(JSON.stringify([m, p])) ?? 0, text = `${n} of ${target}`;
     if (field.textContent !== text) field.textContent = text;
-    field.type = "button";
     field.className = n >= target ? "done" : "";
     field.setAttribute("aria-label", `${named(m, p)}: ${text}`);
     field.setAttribute("aria-pressed", m === material && p === position);
@@ -76,23 +74,15 @@ function outcome(sweep) {
 }
 
 function drawSweep() {
-  const {recording, last} = seen, which = recording?.discard ?? null;
+  const {recording, last} = seen, which = recording?.discard ?? null, {picture, why} = drawLast();
   enable(byId("discard"), may() && which !== null);
   put("discard", which === null ? "Discard" : `Discard sweep ${which}`);
-  byId("status").hidden = !last;
-  if (!last) {
-    for (const draw of [signal, spectrogram]) draw(byId(draw.name), null, "no sweep yet");
-    return;
-  }
-  mark(byId("status"), last.status);
-  put("sweep-title", `Sweep ${last.sweep}, ${since(last.time_ns)}`);
+  spectrogram(byId("spectrogram"), picture, why);
+  if (!last) return;
   put("outcome", outcome(last));
   const wrong = last.status === "recorded" ? "" : `${last.reason}; it is not counted`;
   const lost = last.lost ? `${last.lost} lost frames filled in` : "";
   put("check", [wrong, last.detail, lost].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels; nothing is wrong");
-  const {picture, why} = lastPicture();
-  signal(byId("signal"), picture, why, recording?.unit || undefined);
-  spectrogram(byId("spectrogram"), picture, why);
 }
 
 function drawSkin() {

@@ -1,7 +1,8 @@
 /* What the pages of palpate record and palpate teach share: their events, the head, the call, the last sweep and orders. */
 
 import {listen} from "./events.js";
-import {ago, byId, call, enable, frame, listenToPedal, order, put} from "./parts.js";
+import {ago, asked, byId, call, enable, frame, listenToPedal, mark, order, put, redraw} from "./parts.js";
+import {signal} from "./plots.js";
 
 /* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
    finished: the person has ended the program, so that no connection is no fault. dirty: something is to be drawn. */
@@ -63,8 +64,10 @@ function drawCall(wanted) {
 }
 
 /* The picture of the last sweep, null without; it is asked for once. why: why there is none. */
-export function lastPicture() {
-  const {last, picture, reached} = seen, drawing = picture?.sweep === last.sweep ? picture : null;
+function lastPicture() {
+  const {last, picture, reached} = seen;
+  if (!last) return {picture: null, why: "no sweep yet"};
+  const drawing = picture?.sweep === last.sweep ? picture : null;
   const why = !last.signal ? "it has no window" : drawing?.asked ? `asking ${program}` : "its signal is not kept";
   if (last.signal && !drawing && reached) fetchPicture(last.sweep);
   return {picture: drawing?.taxels ? drawing : null, why};
@@ -72,13 +75,19 @@ export function lastPicture() {
 
 async function fetchPicture(sweep) {
   seen.picture = {sweep, asked: true};
-  let got = {sweep};
-  try {
-    const answer = await fetch(`sweep/${sweep}`, {cache: "no-store"});
-    if (answer.ok) got = await answer.json();
-  } catch { /* said where the signal would be; asked again when the connection is back */ }
+  const got = await asked(`sweep/${sweep}`) ?? {sweep};
   if (seen.last?.sweep === sweep) seen.picture = got;
   seen.dirty = true;
+}
+
+/* Draws the last sweep but what was found. Its picture, and why there is none. */
+export function drawLast() {
+  const {last, recording} = seen, {picture, why} = lastPicture();
+  byId("status").hidden = !last;
+  if (last) mark(byId("status"), last.status);
+  put("sweep-title", last ? `Sweep ${last.sweep}, ${since(last.time_ns)}` : "Last sweep");
+  signal(byId("signal"), picture, why, recording?.unit || undefined);
+  return {picture, why};
 }
 
 /* Does `act` with a function that sends one order and gives why it was refused, "" where it was not; one `act` at a time:
@@ -112,17 +121,5 @@ export function run({name, draw, wanted, pedal, heard = {}}) {
     if (reached && !seen.picture?.taxels) seen.picture = null;
   });
   listenToPedal(pedal);
-  const tick = () => {
-    if (seen.dirty) {
-      seen.dirty = false;
-      draw();
-    }
-    drawCall(wanted);
-    requestAnimationFrame(tick);
-  };
-  for (const [what, event] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) {
-    what.addEventListener(event, () => { seen.dirty = true; });
-  }
-  setInterval(() => { seen.dirty = true; }, 1000);
-  tick();
+  redraw(Object.assign(seen, {draw, each() { drawCall(wanted); }}));
 }

@@ -1,6 +1,6 @@
 /* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
 import {listen} from "./events.js";
-import {byId, figure as text, fill, frame, last, put} from "./parts.js";
+import {byId, count, figure as text, fill, frame, last, made, put} from "./parts.js";
 import {shades} from "./skin.js";
 
 const NUMBERED = 8;
@@ -10,24 +10,14 @@ function build([rows, cols, axes], unit) {
   fill(byId("maps"));
   tiles = [];
   for (let a = 0; a < axes; a++) {
-    const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    const grid = document.createElement("div"), here = [];
-    const axis = axes > 1 ? `axis ${a + 1}${a + 1 === axes ? " (normal)" : ""}: ` : "";
-    caption.textContent = `${axis}${unit || "raw counts"} above the lowest seen; row 1 is at the top, column 1 at the left`;
-    grid.className = cols > NUMBERED ? "grid small" : "grid";
+    const axis = axes > 1 ? `axis ${a + 1}${a + 1 === axes ? " (normal)" : ""}: ` : "", figure = made("figure", "", undefined, byId("maps"));
+    made("figcaption", "", `${axis}${unit || "raw counts"} above the lowest seen; row 1 is at the top, column 1 at the left`, figure);
+    const grid = made("div", cols > NUMBERED ? "grid small" : "grid", undefined, figure);
     grid.setAttribute("role", "img");
     grid.setAttribute("aria-label", `${axis}${rows} rows and ${cols} columns of taxels`);
     grid.style.gridTemplateColumns = `repeat(${cols}, minmax(0, 1fr))`;
-    for (let i = 0; i < rows * cols; i++) {
-      const tile = document.createElement("div");
-      tile.className = "taxel";
-      grid.append(tile);
-      here.push(tile);
-    }
+    tiles.push(Array.from({length: rows * cols}, () => made("div", "taxel", undefined, grid)));
     figure.style.setProperty("--shape", cols / rows);
-    figure.append(caption, grid);
-    byId("maps").append(figure);
-    tiles.push(here);
   }
 }
 
@@ -59,8 +49,8 @@ function show(view) {
   byId("trouble").hidden = !view.trouble;
   put("trouble", view.trouble);
   put("rate", view.rate_hz === null ? "–" : `${view.rate_hz.toFixed(1)} Hz`);
-  put("frames", view.frames.toLocaleString("en"));
-  put("lost", view.lost === null ? "cannot be known" : view.lost.toLocaleString("en"));
+  put("frames", count(view.frames));
+  put("lost", view.lost === null ? "cannot be known" : count(view.lost));
   if (view.load.length) draw(view);
 }
 

@@ -1,10 +1,10 @@
 /* The start: a way to each page, what is connected, and the other boxes of the site. */
 
 import {sentence, shiftOf} from "./history.js";
-import {byId, fill, made, put} from "./parts.js";
+import {asked, byId, changed, fill, made, put} from "./parts.js";
 
 const EVERY_MS = 10_000, OTHER_PORT = "8138"; // of the pages that record and teach
-let askedAt = -Infinity, boxes = "";
+let askedAt = -Infinity;
 
 /* A page that runs only while a person records or teaches: the way to it, or how to start it. */
 function tile(id, runs, words) {
@@ -18,12 +18,8 @@ function tile(id, runs, words) {
 
 async function askForBoxes() {
   askedAt = performance.now();
-  let found = [];
-  try {
-    const answer = await fetch("boxes/0", {cache: "no-store"});
-    if (answer.ok) found = await answer.json();
-  } catch { /* the head says that there is no connection */ }
-  if (boxes === (boxes = JSON.stringify(found))) return;
+  const found = await asked("boxes/0") ?? [];
+  if (!changed(byId("boxes"), found)) return;
   byId("boxes-card").hidden = !found.length;
   fill(byId("boxes"), ...found.filter((one) => /^https?:\/\//.test(one.address)).map((one) => {
     const row = made("li");
@@ -41,9 +37,7 @@ export function drawStart(known, last, heardAt, again) {
   tile("start-record", Boolean(health?.recording && !health.teach), "Record sweeps for training on a desktop. On the box:");
   const there = !hello || !health ? {} : {skin: `${hello.skin}, ${health.skin}`, bundle: health.model || health.bundle || "none",
     frames: `${hello.format.rows}x${hello.format.cols} taxels at ${hello.format.rate_hz} Hz`, ...(hello.finger ? {finger: hello.finger} : {})};
-  const text = JSON.stringify(there);
-  if (byId("there").dataset.shown !== text) {
-    byId("there").dataset.shown = text;
+  if (changed(byId("there"), there)) {
     fill(byId("there"), ...Object.entries(there).flatMap(([name, value]) => [made("dt", "", name), made("dd", "", value)]));
   }
   if (performance.now() - askedAt > EVERY_MS) askForBoxes();

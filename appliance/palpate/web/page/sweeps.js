@@ -1,11 +1,11 @@
 /* The latest sweeps, as a list with filters. */
 
-import {byId, clock, common, count, counted, fill, made, mark, percentAtMost} from "./parts.js";
+import {byId, changed, clock, common, count, counted, fill, made, mark, percentAtMost} from "./parts.js";
 import {WORDS} from "./verdict.js";
 
 const SHOWN = 200;
 const statuses = new Set(); // which are shown; none: all
-let drawn = "", all = false;
+let all = false;
 
 export function key(one) { return `${one.pid}-${one.sweep}`; }
 
@@ -14,9 +14,7 @@ export function drawSweeps(known, chosen, again) {
   drawFilter(known.verdicts);
   const wanted = known.verdicts.filter((one) => !statuses.size || statuses.has(one.status)).reverse();
   const shown = all ? wanted : wanted.slice(0, SHOWN), rows = byId("rows");
-  const content = JSON.stringify([shown.length, shown[0] && key(shown[0]), known.notes.length, [...statuses], known.run]);
-  if (content !== drawn) {
-    drawn = content;
+  if (changed(rows, [shown.length, shown[0] && key(shown[0]), known.notes.length, [...statuses], known.run])) {
     const before = rows.scrollTop, height = rows.scrollHeight, notes = statuses.size ? [] : [...known.notes].reverse(), parts = [];
     for (const one of shown) {
       while (notes.length && notes[0].time_ns >= one.time_ns) parts.push(made("p", "note", `${clock(notes[0].at)}  ${notes.shift().text}`));
@@ -38,7 +36,7 @@ function drawFilter(verdicts) {
   if ([...there.keys()].join() !== names.join()) {
     for (const [name, one] of there) if (!names.includes(name)) one.remove();
     names.forEach((name, i) => {
-      const button = there.get(name) ?? Object.assign(document.createElement("button"), {type: "button"});
+      const button = there.get(name) ?? made("button");
       button.dataset.status = name;
       if (byId("filter").children[i] !== button) byId("filter").insertBefore(button, byId("filter").children[i] ?? null);
     });

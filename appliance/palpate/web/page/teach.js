@@ -1,12 +1,11 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
-import {ago, byId, enable, fill, made, mark, percentAtMost, put} from "./parts.js";
-import {signal} from "./plots.js";
-import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since, startAddress} from "./recording.js";
+import {ago, byId, changed, enable, fill, made, percentAtMost, put} from "./parts.js";
+import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen, startAddress} from "./recording.js";
 
 const STEPS = {start: "waiting for the processor", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 const NOT_THIS = "not this"; // the material of sweeps over other things, which move the limit of unknown ones
-let listed = "", ended = false, usedMs = 0;
+let ended = false, usedMs = 0;
 
 function teach() { return seen.recording?.teach ?? null; }
 
@@ -43,18 +42,14 @@ function drawTask() {
 function drawMaterials() {
   const {recording} = seen;
   const held = teach()?.materials ?? Object.fromEntries((recording?.trying?.labels ?? []).map((name) => [name, null]));
-  const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), may("teach")]);
-  if (content === listed) return;
-  listed = content;
+  if (!changed(byId("materials"), [held, recording?.displays, recording?.material, Boolean(recording?.trying), may("teach")])) return;
   fill(byId("materials"), ...Object.entries(held).map(([name, n]) => {
     const row = made("li"), pick = made("button", "", n === null ? shown(name) : `${shown(name)}: ${n}`, row);
-    pick.type = "button";
     pick.dataset.material = name;
     pick.setAttribute("aria-pressed", `${!recording.trying && name === recording.material}`);
     enable(pick, may("teach"));
     if (n !== null) {
       const forget = made("button", "forget", "Forget", row);
-      forget.type = "button";
       forget.dataset.forget = name;
       forget.setAttribute("aria-label", `Forget ${shown(name)}`);
       enable(forget, may("teach"));
@@ -80,14 +75,13 @@ function drawLearnt() {
     put("learnt", "");
     put("advice", "");
   }
-  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])], text = JSON.stringify(suspects);
-  if (byId("suspects").dataset.text !== text) {
-    byId("suspects").dataset.text = text;
+  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])];
+  if (changed(byId("suspects"), suspects)) {
     fill(byId("suspects"), ...suspects.map((one) => {
       const row = made("li", "", one.text);
       if (now.materials[one.looks_like] === undefined) return row;
       const button = made("button", "", `Move to ${shown(one.looks_like)}`, row);
-      Object.assign(button, {type: "button"}).dataset.move = `${Number(one.sweep.split("-")[1])},${one.looks_like}`;
+      button.dataset.move = `${Number(one.sweep.split("-")[1])},${one.looks_like}`;
       return row;
     }));
   }
@@ -112,19 +106,11 @@ function drawLearnt() {
 }
 
 function drawSweep() {
-  const {recording, last} = seen;
-  byId("status").hidden = !last;
-  if (!last) {
-    put("sweep-title", "Last sweep");
-    put("outcome", "no sweep yet");
-    return signal(byId("signal"), null, "no sweep yet");
-  }
-  mark(byId("status"), last.status);
-  put("sweep-title", `Sweep ${last.sweep}, ${since(last.time_ns)}`);
+  const {last} = seen;
+  drawLast();
+  if (!last) return put("outcome", "no sweep yet");
   const wrong = last.faulty ? `${last.reason}; it does not count` : "";
   put("outcome", [wrong, last.detail].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels, rest");
-  const {picture, why: none} = lastPicture();
-  signal(byId("signal"), picture, none, recording?.unit || undefined);
 }
 
 /* The box works for the robot now, and this program has ended. */

@@ -1,6 +1,6 @@
 /* The card that is read from two metres: what the box said, whether that can be trusted, and what to do now. */
 
-import {ago, byId, clock, fill, made, mark, percent, percentAtMost, put} from "./parts.js";
+import {ago, byId, changed, clock, fill, made, mark, percent, percentAtMost, put} from "./parts.js";
 import {STATUSES} from "./statuses.js";
 
 /* By status: how the card is coloured, what the box says in words, and what to do. */
@@ -92,8 +92,7 @@ export function drawCard(shown) {
   byId("why").hidden = !shown.detail;
   put("detail", shown.detail);
   const moved = shown.moved ?? null; // a card without an answer has none
-  if (byId("moved").dataset.shown === String(moved)) return;
-  byId("moved").dataset.shown = moved;
+  if (!changed(byId("moved"), moved)) return;
   fill(byId("moved"), ...(moved === null ? [] : [`${moved}: `]));
   if (moved !== null) Object.assign(made("a", "", "align the skin", byId("moved")), {href: "#align"});
 }

@@ -2,7 +2,7 @@
    itself; the alignment of the skin; the history. */
 
 import {listen} from "./events.js";
-import {ago, byId, clock, count, figure, fill, frame, last, made, percent, put} from "./parts.js";
+import {ago, asked, byId, changed, clock, count, figure, fill, frame, last, made, percent, put, redraw} from "./parts.js";
 import {course, signal, spectrogram} from "./plots.js";
 import {drawHistory, drawShift, listenToHistory, save} from "./history.js";
 import {SkinPicture, wayBack} from "./skin.js";
@@ -12,9 +12,9 @@ import {listenToTablet, play} from "./tablet.js";
 import {card, drawCard, skin} from "./verdict.js";
 
 const VIEWS = ["start", "watch", "align", "history"], SPOKEN_MS = 3000, KEPT = 5000, PICTURES = 20, SCORES = 6;
-const SKIN = new SkinPicture(document.createElement("div"));
+const SKIN = new SkinPicture(document.createElement("div")), PAGE = {dirty: true, draw};
 let known; // what the box has said; see begin()
-let reached = null, answers = true, wallMs = 0, dirty = true, spokenAt = -Infinity, allScores = false;
+let reached = null, answers = true, wallMs = 0, spokenAt = -Infinity, allScores = false;
 
 function begin() {
   known = {run: "", hello: null, box: null, health: null, view: null, verdicts: [], notes: [], minutes: [], signals: new Map(),
@@ -197,14 +197,11 @@ function drawScores(one) {
   more.hidden = every.length <= SCORES;
   more.setAttribute("aria-expanded", allScores);
   put("more", allScores ? `the ${SCORES} most probable` : `all ${every.length} materials`);
-  if (list.dataset.shown === JSON.stringify(shown)) return;
-  list.dataset.shown = JSON.stringify(shown);
+  if (!changed(list, shown)) return;
   fill(list, ...shown.map(([label, p]) => {
-    const item = made("li"), bar = document.createElement("meter");
+    const item = made("li");
     made("span", "", label, item);
-    bar.value = p;
-    bar.setAttribute("aria-label", label);
-    item.append(bar);
+    Object.assign(made("meter", "", undefined, item), {value: p}).setAttribute("aria-label", label);
     made("span", "number", percent(p), item);
     return item;
   }));
@@ -213,19 +210,14 @@ function drawScores(one) {
 async function fetchPicture(which, number) {
   known.pictures.set(which, null);
   const {pictures} = known;
-  let picture = false;
-  try {
-    const answer = await fetch(`sweep/${number}`, {cache: "no-store"});
-    if (answer.ok) picture = await answer.json();
-  } catch { /* shown as no signal; asked again when the connection is back */ }
-  pictures.set(which, picture);
+  pictures.set(which, await asked(`sweep/${number}`) ?? false);
   while (pictures.size > PICTURES) pictures.delete(pictures.keys().next().value);
-  dirty = true;
+  again();
 }
 
 function select(which) {
   known.chosen = which;
-  dirty = true;
+  again();
 }
 
 function drawCourse() {
@@ -262,7 +254,6 @@ function drawFacts() {
 }
 
 function draw() {
-  dirty = false;
   choose();
   drawHeader();
   drawSkin();
@@ -279,23 +270,18 @@ function draw() {
 }
 
 /* Only what has changed many times a second is drawn as often. */
-function tick() {
-  if (dirty) draw();
-  requestAnimationFrame(tick);
-}
-
 const FAST = new Set(["view", "now"]);
 listen(Object.fromEntries(Object.entries(HEARD).map(([name, act]) => [name, (content) => {
   act(content);
-  if (!FAST.has(name) || sees("align") || document.body.dataset.view === "") dirty = true;
+  if (!FAST.has(name) || sees("align") || document.body.dataset.view === "") again();
   else drawSkin();
 }])), (there, program) => {
   [reached, answers] = [there, program];
   if (there) for (const [which, picture] of known.pictures) if (!picture) known.pictures.delete(which);
-  dirty = true;
+  again();
 });
 
-function again() { dirty = true; }
+function again() { PAGE.dirty = true; }
 
 /* A label by the name that people read. */
 function shownAs(label) { return known.hello?.names[known.hello.labels.indexOf(label)] ?? label; }
@@ -313,8 +299,5 @@ byId("more").addEventListener("click", () => {
   again();
 });
 byId("follow").addEventListener("click", () => select(null));
-addEventListener("hashchange", () => { dirty = true; });
-addEventListener("resize", () => { dirty = true; });
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { dirty = true; });
-setInterval(() => { dirty = true; }, 1000);
-tick();
+addEventListener("hashchange", again);
+redraw(PAGE);
