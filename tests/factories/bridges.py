@@ -16,7 +16,6 @@ import pytest
 
 from palpate.bridges import command, serve
 from palpate.bridges.options import PORTS, add_arguments
-from palpate.bridges.server import StopEvent
 
 LONG_S = 30.0
 
@@ -40,9 +39,10 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     there: Future[tuple[str, int]] = Future()
     ended, ends = Future[int](), []
 
-    def stop_event() -> StopEvent:
-        stop, loop = StopEvent(), asyncio.get_running_loop()
-        ends.append(lambda: loop.call_soon_threadsafe(stop.end, 0))
+    def stop_code() -> asyncio.Future[int]:
+        loop = asyncio.get_running_loop()
+        stop = loop.create_future()
+        ends.append(lambda: loop.call_soon_threadsafe(stop.set_result, 0))
         return stop
 
     class StopSwitch(threading.Event):
@@ -62,7 +62,7 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
             there.cancel()
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(serve, "stop_event", stop_event)
+        patched.setattr(serve, "stop_code", stop_code)
         patched.setattr(serve, "_say", lambda args, server, box: there.set_result(server.address))
         patched.setattr(command, "StopFlag", StopSwitch)
         threading.Thread(target=work, daemon=True).start()

@@ -26,7 +26,6 @@ class MemoryBridge:
         self._log = SparseLog(clock.now_ns)
 
     def close(self) -> None:
-        """Close both."""
         self._feed.close()
         self._file.close()
 

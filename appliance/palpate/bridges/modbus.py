@@ -139,7 +139,6 @@ COUNTERS = (
 
 
 def _words(entries: Sequence[Register], view: BoxView) -> list[int]:
-    """The words of some entries."""
     words: list[int] = []
     for register in entries:
         value, top = register.get(view), 1 << 16 * register.words

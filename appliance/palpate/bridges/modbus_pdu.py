@@ -86,7 +86,6 @@ def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes
 
 
 def reply(request: ModbusRequest, pdu: bytes) -> bytes:
-    """The bytes that answer a request."""
     return HEADER.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
 
 

@@ -104,7 +104,6 @@ class MqttBridge:
         self.source = source_of(args, self._take)
 
     def close(self) -> None:
-        """Close the connection to the box."""
         self.source.close()
         self._woken.close()
         self._wakes.close()

@@ -79,7 +79,6 @@ class OpcuaBridge:
         self.source = source_of(args, self._take)
 
     async def close(self) -> None:
-        """End all connections."""
         with suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_S):  # peers that do not read their rest
                 await self._server.stop()

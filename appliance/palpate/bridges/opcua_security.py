@@ -175,9 +175,3 @@ def limit(server: Server, most: int, *, users: bool, anonymous: bool) -> None:
         return await create(params, *more, **options)
 
     service.create_subscription = paced
-
-
-def hide_open_endpoint(server: Server) -> None:
-    """Leave out of the list the endpoint without encryption, which then serves discovery alone."""
-    ends = server.iserver.endpoints
-    ends[:] = [end for end in ends if end.SecurityMode != ua.MessageSecurityMode.None_]

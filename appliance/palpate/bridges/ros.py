@@ -157,7 +157,6 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
             self.trigger_activate()
 
     def setting(self, name: str) -> Any:
-        """A parameter of the node."""
         return self.get_parameter(name).value
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -45,7 +45,6 @@ class OptionalTopics:
             )
 
     def close(self) -> None:
-        """End what `open` has begun."""
         for publisher in self._publishers.values():
             self._node.destroy_lifecycle_publisher(publisher)
         self._publishers = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import signal
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from functools import partial
@@ -11,9 +12,10 @@ from ipaddress import ip_address
 from typing import Any
 
 from palpate.bridges.options import needed
-from palpate.bridges.server import TcpServer, address, stop_event
+from palpate.bridges.server import TcpServer, address
 from palpate.bridges.source import port_of, source_of
 from palpate.core.clock import SystemClock
+from palpate.core.interrupts import INTERRUPTED
 from palpate.core.log import log
 from palpate.core.retry import retried
 from palpate.service import network
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     host, port = address(args.listen)
 
     async def serve() -> int:
-        stop = stop_event()
+        code = stop_code()
         async with AsyncExitStack() as stack:
             server, box, close = SERVERS[args.kind](args)
             stack.push_async_callback(close)
@@ -69,15 +71,27 @@ def run(args: argparse.Namespace) -> int:
             own, at = server.address  # port 0 has become one of its own
             end = network.announce(args.kind, own, at, args.name)
             stack.push_async_callback(asyncio.to_thread, end)
-            ends = {asyncio.create_task(stop.wait()), *server.tasks}
-            for task in (await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]:
-                task.result()
+            ends = {code, *server.tasks}
+            for ended in (await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]:
+                ended.result()
             log.info("stopped")
-        return stop.code
+        return await code
 
-    codes: list[int] = []
-    retried(lambda: codes.append(asyncio.run(serve())), SystemClock())
-    return codes[-1]
+    return retried(lambda: asyncio.run(serve()), SystemClock())
+
+
+def stop_code() -> asyncio.Future[int]:
+    """The exit code, once SIGTERM or SIGINT comes."""
+    loop = asyncio.get_running_loop()
+    stop = loop.create_future()
+
+    def end(code: int) -> None:
+        if not stop.done():
+            stop.set_result(code)
+
+    loop.add_signal_handler(signal.SIGTERM, end, 0)
+    loop.add_signal_handler(signal.SIGINT, end, INTERRUPTED)
+    return stop
 
 
 def _say(args: argparse.Namespace, server: Any, box: str) -> None:

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import re
-import signal
 import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
 from palpate.core.errors import AddressError, ConfigError
-from palpate.core.interrupts import INTERRUPTED
 
 QUIET_S = 5.0
 """If the server is full, a connection that has sent nothing for this long is closed for a new
@@ -71,7 +69,6 @@ class TcpPeer:
             await self._writer.drain()
 
     def drop(self) -> None:
-        """End the connection at once."""
         self._writer.transport.abort()
 
     async def close(self) -> None:
@@ -138,25 +135,6 @@ class TcpServer:
         finally:
             self.peers.discard(peer)
             await peer.close()
-
-
-class StopEvent(asyncio.Event):
-    """Set by a signal. code: exit code of the program that it ends."""
-
-    code = 0
-
-    def end(self, code: int) -> None:
-        """End the program with this exit code."""
-        self.code = code
-        self.set()
-
-
-def stop_event() -> StopEvent:
-    """Set by SIGTERM or SIGINT from now on."""
-    stop, loop = StopEvent(), asyncio.get_running_loop()
-    for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, INTERRUPTED)):
-        loop.add_signal_handler(number, stop.end, code)
-    return stop
 
 
 def not_listening(host: str, port: int, e: Exception) -> ConfigError:

@@ -70,7 +70,6 @@ class BoxView:
     trouble: str = ""
 
     def alive(self, now_ns: int) -> bool:
-        """Whether the box was heard lately."""
         return self.heard_ns > 0 and now_ns - self.heard_ns < STALE_S * 1e9
 
     def code(self, label: str) -> int:
@@ -249,7 +248,6 @@ class LinkPort:
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that can be read now."""
         return int(struct.unpack("i", fcntl.ioctl(self._far, termios.FIONREAD, bytes(4)))[0])
 
     def read(self, size: int) -> bytes:

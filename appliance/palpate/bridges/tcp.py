@@ -49,7 +49,6 @@ class TcpBridge:
         self._line = Line(opener, self._heard, lambda: None, name=name)
 
     def close(self) -> None:
-        """Close the line."""
         self._line.close()
 
     def _heard(self, heard: Sentence) -> None:
@@ -69,7 +68,6 @@ class TcpBridge:
             peer.write(line)
 
     async def serve(self, peer: TcpPeer) -> None:
-        """Pass on the commands of one peer."""
         rest = b""
         while data := await peer.read(None):
             found, rest = sentences.parse(data, rest)

@@ -88,12 +88,10 @@ class Palpate:
         self.close()
 
     def close(self) -> None:
-        """Close the line."""
         self._line.close()
 
     @property
     def trouble(self) -> str:
-        """The reason why the line is not open, "" if it is."""
         return self._line.trouble
 
     def silent_s(self) -> float:

@@ -96,7 +96,6 @@ class Feed:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection."""
         return self._connection is not None
 
     def fileno(self) -> int:

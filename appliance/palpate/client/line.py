@@ -74,7 +74,6 @@ class Line:
                 raise LinkLost(f"{self._name} does not take anything: {e}; check its cable") from e
 
     def close(self) -> None:
-        """End the thread and close the port."""
         self._ending.set()
         self._thread.join(10 * (READ_S + WRITE_S))
 

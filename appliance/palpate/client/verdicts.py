@@ -71,7 +71,6 @@ class VerdictFile:
             self._opened = opened.pop_all()
 
     def close(self) -> None:
-        """Close the file."""
         self.db.close()
         self._opened.close()
 

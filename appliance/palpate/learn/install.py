@@ -145,7 +145,6 @@ def assessed(settings: Config, store: Store, clock: Clock) -> News:
 
 
 def described(found: News) -> str:
-    """An assessment for a person."""
     suspected = [one["text"] for one in (*found["no_slides"], *found["suspects"])]
     return "\n".join([found["text"], *suspected, f"next: {found['advice']}"])
 

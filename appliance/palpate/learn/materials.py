@@ -59,7 +59,6 @@ def delivered(running: SignedBundle) -> bool:
 
 
 def trained(running: Bundle) -> tuple[str, ...]:
-    """The labels that a bundle was trained on."""
     return tuple(name for name in running.manifest.labels if name not in running.enrolled)
 
 

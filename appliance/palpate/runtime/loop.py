@@ -197,7 +197,6 @@ class Box:
 
     @property
     def _able(self) -> bool:
-        """True while a sweep could be taken."""
         return self._sensor.state == "streaming" and not self._trigger.blind
 
     def _show(self) -> None:
@@ -414,7 +413,6 @@ def _succeeds(what: str, act: Callable[[], object]) -> bool:
 
 
 def _answer(name: str, reply: Future[list[object]]) -> bytes:
-    """The ANS sentence to a command that is done."""
     if e := reply.exception():
         return sentence("ANS", name, "error", str(e) or type(e).__name__)
     return sentence("ANS", name, "ok", *reply.result())

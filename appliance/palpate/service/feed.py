@@ -254,7 +254,6 @@ class FeedServer(Observer):
 
 
 def _hello(format: SweepFormat, facts: Mapping[str, Any], most_hz: float) -> bytes:
-    """The first line of each connection."""
     program = {"schema": FEED_SCHEMA, "version": __version__, "pid": os.getpid()}
     sweeps = {"format": format.json(), "window_s": format.window / format.rate_hz}
     return encode("hello", {**program, **facts, **sweeps, "frames_hz": most_hz})

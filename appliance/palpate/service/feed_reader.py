@@ -124,7 +124,6 @@ class Reader:
 
     @property
     def waits(self) -> bool:
-        """Whether there is something to send."""
         return bool(self._queue or self._lost)
 
     def put(self, line: bytes) -> None:

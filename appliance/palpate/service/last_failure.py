@@ -50,7 +50,6 @@ class Failure(NamedTuple):
 
     @property
     def pause_s(self) -> float:
-        """Pause before the next start."""
         return PAUSES_S[min(self.failures, len(PAUSES_S)) - 1]
 
 

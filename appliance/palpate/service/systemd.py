@@ -64,7 +64,6 @@ class Notifier(Observer):
                 self._next_ns = now_ns + self._watchdog_us * 1000 // FEEDS
 
     def stopping(self) -> None:
-        """Announce that the program is about to end."""
         self._send(["STOPPING=1"])
 
     def _send(self, messages: list[str]) -> bool:

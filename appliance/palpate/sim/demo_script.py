@@ -35,7 +35,6 @@ def acts(format: SweepFormat, seed: int) -> Iterator[Act]:
 
 
 def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
-    """The sweeps of the demo, drawn one after another."""
     place = skin.placements("T-LAB", PLACES)[0]
 
     def over(tube: str) -> Act:

@@ -47,7 +47,6 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self._pending = b""
 
     def at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Schedule `action` for the time `t_ns`."""
         heapq.heappush(self._agenda, (t_ns, len(self._agenda), action))
 
     def unplug(self) -> None:
@@ -55,7 +54,6 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         self.board.present = self.board.running = False
 
     def plug(self) -> None:
-        """Plug the cable in again."""
         self.board.present = True
 
     def _touch(self, what: str = "") -> None:

@@ -141,7 +141,6 @@ class RecordingSession(Observer):
         return self._folder.run + sweep.id, self._labels_of(sweep).material
 
     def path(self, number: int) -> Path:
-        """The file of a sweep."""
         return self._folder.path(number)
 
     def materials(self) -> dict[str, int]:

@@ -56,9 +56,8 @@ class PageBoard:
         self._tracker: ContactTracker | None = None
         self._enumerations = 0
         self._view_ns = -VIEW_NS
-        self._minute: tuple[int, int, int] | None = (
-            None  # time, frames and lost frames at the begin of the minute
-        )
+        # time, frames and lost frames at the begin of the minute
+        self._minute: tuple[int, int, int] | None = None
         self._windows: OrderedDict[int, DrawnWindow] = OrderedDict()
         self._taken = 0
 
@@ -71,13 +70,10 @@ class PageBoard:
         try:
             act(line)
         except (KeyError, TypeError, ValueError, AttributeError) as e:
-            raise FormatError(
-                f"the feed's line {line.get('type')!r} does not fit PROTOCOL.md: {e!r}; update"
-                " one of both"
-            ) from e
+            what = f"the feed's line {line.get('type')!r} does not fit PROTOCOL.md: {e!r}"
+            raise FormatError(f"{what}; update one of both") from e
 
     def away(self, why: str) -> None:
-        """Show the box as away."""
         self._minute = None
         self._publish("box", {"there": False, "why": why})
 
@@ -92,8 +88,8 @@ class PageBoard:
         tracker = ContactTracker(expected, str(line["source"]))
         displays = {str(k): str(v) for k, v in (line.get("displays") or {}).items()}
         hello = dict(line) | {"pid": int(line["pid"]), "labels": list(map(str, line["labels"]))}
-        hello |= {"names": [displays.get(label, label) for label in hello["labels"]]}
-        hello |= {"finger": self._finger}
+        names = [displays.get(label, label) for label in hello["labels"]]
+        hello |= {"names": names, "finger": self._finger}
         self._names = dict(zip(hello["labels"], hello["names"], strict=True))
         self._before, self._hello, self._tracker, self._minute = self._hello, hello, tracker, None
         self._publish("hello", hello)
@@ -105,9 +101,10 @@ class PageBoard:
     def _take_health(self, line: Mapping[str, Any]) -> None:
         self._take_state(line)
         if self._before and self._before["pid"] != self._hello["pid"]:
-            self._publish(
-                "note", {"time_ns": line["time_ns"], "text": _restarted(self._before, self._hello)}
-            )
+            other = f"bundle {self._hello['bundle']} in place of {self._before['bundle']}"
+            same = self._hello["bundle"] == self._before["bundle"]
+            text = f"the box was restarted, with {'the same bundle' if same else other}"
+            self._publish("note", {"time_ns": line["time_ns"], "text": text})
         self._before = {}
         now = int(line["time_ns"]), int(line["frames"]), int(line["lost_frames"])
         if int(line["enumerations"]) != self._enumerations:
@@ -116,10 +113,8 @@ class PageBoard:
                 self._tracker.reset()
         first = self._minute or now
         if now[0] - first[0] >= MINUTE_NS:
-            self._publish(
-                "minute",
-                {"time_ns": now[0], "frames": now[1] - first[1], "lost": now[2] - first[2]},
-            )
+            counted = {"frames": now[1] - first[1], "lost": now[2] - first[2]}
+            self._publish("minute", {"time_ns": now[0], **counted})
             first = now
         self._minute = first
         self._publish("health", {name: value for name, value in line.items() if name != "type"})
@@ -137,11 +132,10 @@ class PageBoard:
             "name": self._names.get(line["label"], line["label"]),
             "scores": [round(float(p), 4) for p in line["scores"]],
             "moved": line["moved"] or None,
+            "reason": REASONS.get(line["status"], ""),
+            "pid": self._hello.get("pid"),
         }
-        self._publish(
-            "verdict",
-            shown | {"reason": REASONS.get(line["status"], ""), "pid": self._hello.get("pid")},
-        )
+        self._publish("verdict", shown)
 
     def _take_frame(self, line: Mapping[str, Any]) -> None:
         if not self._tracker:
@@ -162,16 +156,5 @@ class PageBoard:
         self._windows[self._taken] = kept
         while len(self._windows) > SWEEPS:
             self._windows.popitem(last=False)
-        self._publish(
-            "signal", {"number": self._taken, "sweep": line["sweep"], "pid": self._hello["pid"]}
-        )
-
-
-def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Description of the changes after a restart."""
-    changed = (
-        f"bundle {now['bundle']} in place of {before['bundle']}"
-        if now["bundle"] != before["bundle"]
-        else "the same bundle"
-    )
-    return f"the box was restarted, with {changed}"
+        shown = {"number": self._taken, "sweep": line["sweep"], "pid": self._hello["pid"]}
+        self._publish("signal", shown)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from palpate.core.clock import Clock
 from palpate.core.errors import ConfigError
 from palpate.service import network
@@ -19,20 +21,13 @@ class OtherBoxes:
     def __call__(self) -> list[dict[str, str]]:
         """The list; it takes some seconds if the last one is too old."""
         now_ns = self._clock.now_ns()
-        if now_ns - self._asked_ns >= KEPT_NS:
-            self._asked_ns = now_ns
-            self._found = self._ask()
+        if now_ns - self._asked_ns < KEPT_NS:
+            return self._found
+        self._asked_ns, own, pages = now_ns, network.box_id(), {}
+        with suppress(ConfigError, OSError):
+            for one in reversed(network.found(self._clock)):  # the lowest port is the start's
+                if one.kind == "page" and not one.box.endswith(own):
+                    host = f"[{one.host}]" if ":" in one.host else one.host
+                    pages[one.box] = f"https://{host}:{one.port}/"
+        self._found = [{"name": box, "address": pages[box]} for box in sorted(pages)]
         return self._found
-
-    def _ask(self) -> list[dict[str, str]]:
-        try:
-            there = network.found(self._clock)
-        except (ConfigError, OSError):
-            return []
-        own = network.box_id()
-        pages = {}
-        for one in reversed(there):  # the lowest port of a box is that of the start
-            if one.kind == "page" and not one.box.endswith(own):
-                host = f"[{one.host}]" if ":" in one.host else one.host
-                pages[one.box] = f"https://{host}:{one.port}/"
-        return [{"name": box, "address": pages[box]} for box in sorted(pages)]

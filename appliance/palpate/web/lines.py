@@ -55,7 +55,6 @@ class LineWatch:
         self._displays: dict[str, str] = {}
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Show the box until `stopped()`."""
         with self._feed:
             while not stopped():
                 self.step()

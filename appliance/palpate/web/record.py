@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from functools import partial
+from functools import lru_cache, partial
 from queue import Empty, Full, Queue
 from typing import Any, Self
 
@@ -58,9 +58,8 @@ def order(body: bytes, allowed: Sequence[str], named: Callable[[str], str] = str
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError) as e:
-        raise FormatError(
-            'an order is not JSON; send {"command": "MATERIAL", "text": "wood"}'
-        ) from e
+        example = '{"command": "MATERIAL", "text": "wood"}'
+        raise FormatError(f"an order is not JSON; send {example}") from e
     if not isinstance(asked, dict) or not asked.keys() <= {"command", "text"}:
         raise FormatError('an order holds "command" and "text" and nothing else; send these two')
     name, text = str(asked.get("command")), asked.get("text", "")
@@ -117,7 +116,6 @@ class CommandQueue:
         return True
 
     def refuse(self) -> None:
-        """Refuse all commands that wait."""
         while self.carry_out(_ended):
             pass
 
@@ -160,15 +158,8 @@ class RecordPage(Observer):
         self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
         by_page = ("START", "STOP") if trigger.mode == "serial" else ()
-        self._commands = (
-            *LABELS,
-            "NEXT",
-            "DISCARD",
-            *PAIRS,
-            "UNDO",
-            *by_page,
-            *(TEACHING if teaching else ()),
-        )
+        taught = TEACHING if teaching else ()
+        self._commands = (*LABELS, "NEXT", "DISCARD", *PAIRS, "UNDO", *by_page, *taught)
         self._known = {
             "source": source,
             "format": str(format),
@@ -178,18 +169,12 @@ class RecordPage(Observer):
         }
         self._queue = CommandQueue()
         self._window: DrawnWindow | None = None
-        self._drawn: tuple[DrawnWindow, dict[str, Any]] | None = None
+        self._picture = lru_cache(1)(lambda window: picture(window))
         self._enumerations = 0
         self._state: tuple[object, ...] = ()
         self._state_ns = self._view_ns = clock.now_ns()
-        self.server = PageServer(
-            f"{'teach' if teaching else 'record'}.html",
-            access,
-            clock.now_ns,
-            {},
-            {"sweep": self._shown},
-            self._ordered,
-        )
+        name, answers = f"{'teach' if teaching else 'record'}.html", {"sweep": self._shown}
+        self.server = PageServer(name, access, clock.now_ns, {}, answers, self._ordered)
 
     def __enter__(self) -> Self:
         self.server.__enter__()
@@ -206,9 +191,8 @@ class RecordPage(Observer):
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Show the result of a sweep, after the recording has stored it."""
-        self._window = (
-            DrawnWindow(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
-        )
+        taxels = sweep.frames.taxels
+        self._window = DrawnWindow(sweep.id, self._rate_hz, taxels) if len(taxels) else None
         self.server.publish(
             "sweep",
             {
@@ -266,15 +250,10 @@ class RecordPage(Observer):
     def _shown(self, which: str) -> dict[str, Any] | None:
         """The picture of the last sweep, if it has this number. It is computed once."""
         window = self._window
-        if not window or window.sweep != int(which):
-            return None
-        if not self._drawn or self._drawn[0] is not window:
-            self._drawn = window, picture(window)
-        return self._drawn[1]
+        return self._picture(window) if window and window.sweep == int(which) else None
 
 
 def trigger_words(trigger: TriggerConfig) -> str:
-    """The trigger of sweeps in words."""
     if trigger.mode == "timed":
         return f"the clock: {trigger.sweep_s:g} s in every {trigger.every_s:g} s"
     return TRIGGERS[trigger.mode]

@@ -111,9 +111,8 @@ class EventLog:
         self._number += 1
         data = json.dumps(content, allow_nan=False, separators=(",", ":"))
         event = f"id: {self.run}-{self._number}\nevent: {name}\ndata: {data}\n\n".encode()
-        self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1))).append(
-            (self._number, event)
-        )
+        kept = self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1)))
+        kept.append((self._number, event))
         return event
 
     def since(self, last: str) -> list[bytes]:
@@ -156,9 +155,9 @@ class PageServer:
         self.server: LimitedServer | None = None
         try:
             self._tls = access.tls()
-            self._sockets = bind_sockets(
-                _checked(access.port), access.address, backlog=2 * MOST_OPEN
-            )
+            if not 0 <= access.port <= 65535:  # the resolver would take it modulo 65536
+                raise ValueError("ports are numbers from 0 to 65535")
+            self._sockets = bind_sockets(access.port, access.address, backlog=2 * MOST_OPEN)
         except (OSError, ValueError) as e:
             where = f"port {access.port} of {access.address}"
             passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
@@ -187,15 +186,12 @@ class PageServer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected."""
         return bool(self.queues)
 
     def publish(self, name: str, content: object) -> None:
         """Send an event to all browsers, and keep it. It never waits. Raises ValueError for a
         number that JSON lacks."""
-        json.dumps(
-            content, allow_nan=False
-        )  # an error belongs to the caller, not into the server's thread
+        json.dumps(content, allow_nan=False)  # an error belongs to the caller, not to the thread
         self._loop.call_soon_threadsafe(self._spread, name, content)
 
     def show(self, view: Any) -> None:
@@ -255,20 +251,12 @@ def page_files() -> dict[str, tuple[str, bytes]]:
     return files | {"/statuses.js": (KINDS[".js"], script)}
 
 
-def _checked(port: int) -> int:
-    """The port. Raises ValueError for other numbers, which the resolver would take modulo 65536."""
-    if not 0 <= port <= 65535:
-        raise ValueError("ports are numbers from 0 to 65535")
-    return port
-
-
 class LimitedServer(HTTPServer):
     """tornado's server with at most MOST_OPEN connections. A further connection takes the place of
     the oldest that has sent no allowed request, else of the oldest. admitted: connections that have
     sent an allowed request."""
 
     def initialize(self, *args: Any, **options: Any) -> None:
-        """As HTTPServer.initialize."""
         super().initialize(*args, **options)
         self._open: list[Any] = []  # the oldest first
         self.admitted: WeakSet[Any] = WeakSet()
@@ -289,11 +277,9 @@ class _Handler(RequestHandler):
     SUPPORTED_METHODS = ("GET",)
 
     def initialize(self, page: PageServer) -> None:
-        """page: the page that gets the request."""
         self.page = page
 
     def set_default_headers(self) -> None:
-        """Set the headers of all answers."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
@@ -333,7 +319,6 @@ class _Handler(RequestHandler):
         server.admitted.add(stream)
 
     def write_error(self, status_code: int, **_: Any) -> None:
-        """Answer with a line of text."""
         self._say(f"{status_code} {self._reason}\n")
 
     def _say(self, text: str) -> None:
@@ -345,7 +330,6 @@ class FileHandler(_Handler):
     """The page and its files. A browser without the token gets a page that asks for it."""
 
     def get(self) -> None:
-        """Answer with a file, or with 404."""
         tokens = self.page.access.tokens
         if self.request.path == "/enter" and tokens:  # the token was right
             self.set_cookie(
@@ -422,13 +406,10 @@ class OrderHandler(_Handler):
     async def prepare(self) -> None:
         """Refuse orders of other sites: they have another origin, and cannot read the key."""
         await super().prepare()
-        headers, own = (
-            self.request.headers,
-            f"{self.request.protocol}://{self.request.headers['Host']}",
-        )
-        if headers.get("Origin") != own or not hmac.compare_digest(
-            headers.get(KEY, "").encode(), self.page.key.encode()
-        ):
+        headers, key = self.request.headers, self.page.key.encode()
+        own = f"{self.request.protocol}://{headers['Host']}"
+        ours = hmac.compare_digest(headers.get(KEY, "").encode(), key)
+        if headers.get("Origin") != own or not ours:
             raise HTTPError(403)
         if headers.get("Content-Type") != "application/json":
             raise HTTPError(415)

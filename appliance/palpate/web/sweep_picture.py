@@ -36,17 +36,10 @@ class DrawnWindow:
 def window(line: Mapping[str, Any], rate_hz: float) -> DrawnWindow:
     """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for a malformed
     line."""
-    dtype, shape, data = (
-        line["dtype"],
-        tuple(map(int, line["shape"])),
-        a2b_base64(line["data"], strict_mode=True),
-    )
-    if (
-        dtype not in DATA_TYPES
-        or len(shape) not in (3, 4)
-        or min(shape) < 1
-        or len(data) > MOST_BYTES
-    ):
+    dtype, shape = line["dtype"], tuple(map(int, line["shape"]))
+    data = a2b_base64(line["data"], strict_mode=True)
+    known = dtype in DATA_TYPES and len(shape) in (3, 4) and min(shape) >= 1
+    if not known or len(data) > MOST_BYTES:
         raise ValueError(f"a window of {shape} {dtype}")
     taxels = np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape)
     return DrawnWindow(int(line["sweep"]), rate_hz, taxels)
@@ -70,9 +63,8 @@ def picture(one: DrawnWindow) -> dict[str, Any]:
         for reduce in (np.minimum.reduceat, np.maximum.reduceat)
     )
     names = [f"{i // cols + 1}.{i % cols + 1}" for i in shown.tolist()]
-    lines = [
-        {"name": name, "low": lo, "high": hi} for name, lo, hi in zip(names, low, high, strict=True)
-    ]
+    each = zip(names, low, high, strict=True)
+    lines = [{"name": name, "low": lo, "high": hi} for name, lo, hi in each]
     return {
         "sweep": one.sweep,
         "seconds": frames / one.rate_hz,
@@ -84,9 +76,8 @@ def picture(one: DrawnWindow) -> dict[str, Any]:
 
 def _spectrogram(taxels: NDArray[Any], rate_hz: float) -> dict[str, Any]:
     try:
-        shares = features.h_features(taxels, rate_hz, "hann").reshape(
-            features.h_shape(len(taxels), rate_hz)
-        )
+        shares = features.h_features(taxels, rate_hz, "hann")
+        shares = shares.reshape(features.h_shape(len(taxels), rate_hz))
     except FormatError as e:
         return {"spectrogram": [], "trouble": str(e)}
     width = round(features.WINDOW_S * rate_hz)

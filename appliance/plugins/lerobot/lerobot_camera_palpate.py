@@ -181,7 +181,6 @@ class PalpateCamera(Camera):  # type: ignore[misc]  # lerobot has no types
 
     @property
     def is_connected(self) -> bool:
-        """Whether the feed is being read."""
         return self._thread is not None
 
     @staticmethod
@@ -206,7 +205,6 @@ class PalpateCamera(Camera):  # type: ignore[misc]  # lerobot has no types
             raise ConnectionError(str(e)) from e
 
     def disconnect(self) -> None:
-        """Close the feed."""
         self._required()
         self._ending.set()
         if self._thread:
