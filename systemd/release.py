@@ -28,7 +28,7 @@ from palpate.deployment import signature
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCK, TEACH_LOCK = (ROOT / "appliance" / name for name in ("requirements.lock", "teach.lock"))
-"""Libraries of the box, and the same with those of teaching at the robot."""
+"""Libraries of the box, and the same with the libraries for teaching at the robot."""
 SUMS, NAMESPACE = "SHA256SUMS", "palpate-release"
 """The list of an archive's files, and the namespace of its signature."""
 GLIBC = 36

@@ -1,7 +1,7 @@
-"""The list of all that the box carries beside Debian, with licences: a software bill of materials.
+"""The list of all that the box adds to Debian, with licences: a software bill of materials.
 
-`python systemd/sbom.py OUT.json` writes CycloneDX 1.5 (ECMA-424). Versions and hashes are those of
-appliance/teach.lock, which has all of the box, licences those that the installed packages state.
+`python systemd/sbom.py OUT.json` writes CycloneDX 1.5 (ECMA-424). Versions and hashes come from
+appliance/teach.lock, which has all of the box, licences from the installed packages.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ OPTIONS: Mapping[str, Row] = {
         {"metavar": "URL"}),
     "login": ("--login", "user on its first line, password on its second (bridge.login)",
         {"metavar": "FILE"}),
-    "ca": ("--ca", "certificates to trust; default: those of the system (bridge.ca)",
+    "ca": ("--ca", "certificates to trust; default: the system's (bridge.ca)",
         {"metavar": "FILE"}),
     "of-box": ("--feed", "the box's feed (store.runtime)", {"metavar": "PATH"}),
     "file": ("--file", "SQLite (bridge.memory)", _PATH),
@@ -86,7 +86,7 @@ KINDS: Mapping[str, tuple[str, str]] = {
         "baud port|link|feed writes broker login ca name"),
     "memory": ("every verdict of 90 days in a file, for palpate status --since", "of-box file"),
     "ros": ("the box as a ROS 2 node", "ros"),
-    "fuse": ("the answers of several fingers, each with a unit of its own, as those of one hand",
+    "fuse": ("the answers of several fingers, each with a unit of its own, fused to one answer",
         "baud fingers robot"),
 }
 # fmt: on
@@ -160,7 +160,7 @@ class _Later(ModuleType):
 @contextmanager
 def needed(what: str, extra: str, *hardly: str) -> Iterator[None]:
     """Raises ConfigError if an import fails: `what` is not installed, and `extra` has it. hardly:
-    modules that it imports for what no bridge does; they take 2 MiB."""
+    modules that it imports and no bridge uses; they take 2 MiB."""
     absent = [_Later(name) for name in hardly if name not in sys.modules]
     for one in absent:
         above, _, own = one.__name__.rpartition(".")

@@ -132,8 +132,8 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
         raise BundleError(f"{ENROLMENT} names no bundle and its labels; {AGAIN}")
     if base.item() != bundle.base:
         raise BundleError(
-            f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files beside it are those "
-            f"of {bundle.id}; {AGAIN}"
+            f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files next to it to "
+            f"{bundle.id}; {AGAIN}"
         )
     if bundle.classes is None or not bundle.manifest.known:
         raise BundleError(

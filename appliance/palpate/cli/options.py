@@ -118,7 +118,7 @@ OPTIONS: Mapping[str, Row] = {
         {"action": "append", "default": [], "metavar": "NAME", "dest": "labels"}),
     "good": ("--sweeps", "number of good sweeps of each --label (default 8)",
         _count_of(default=8, dest="good")),
-    "use": ("--use", "make a bundle of all sweeps, after those of --label; it runs on trial",
+    "use": ("--use", "make a bundle of all sweeps, after the sweeps of --label; it runs on trial",
         _FLAG),
     "unknown": ("--unknown", "take kept sweeps (store.black_box) that were answered `unknown, as"
         " sweep N` as sweeps of --label: those that sweep NUMBER belongs to. Without --label,"

@@ -147,9 +147,7 @@ def _forget(settings: Config, material: str) -> int:
         called = [one for _, one in held if name in (one.get("material"), one.get("display"))]
         material = Labels(str(called[0].get("material")) if called else name).material
         if not called and name not in assembly.running(settings).bundle.enrolled:
-            raise ConfigError(
-                f"there is no material {name!r} to forget; name one that was recorded"
-            )
+            raise ConfigError(f"there is no material {name!r} to forget; name a recorded material")
         folder.forget(material, [n for n, one in held if one.get("material") == material])
     print(f"{material}: its sweeps so far are no longer taught; they stay in {folder.folder}")
     return 0

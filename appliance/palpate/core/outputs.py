@@ -47,7 +47,7 @@ def file(*endings: str) -> Callable[[str], Path]:
         path, known = Path(text), " or ".join(endings)
         if path.suffix.lower() not in ("", *endings):
             why = f"{text} would not be a {path.suffix} file"
-            raise ArgumentTypeError(f"{why}; name one that ends in {known}")
+            raise ArgumentTypeError(f"{why}; use a name that ends in {known}")
         return path
 
     return read

@@ -65,7 +65,7 @@ def sidecar(path: Path) -> dict[str, Any]:
 
 
 def _broken(path: Path, why: object) -> FormatError:
-    form = "a recording is an .npy with its .json beside it"
+    form = "a recording is an .npy with its .json next to it"
     return FormatError(f"{path}: not a recorded sweep ({why}); {form}")
 
 

@@ -249,8 +249,8 @@ class Shadow(Observer):
         if found.starts >= STARTS:
             self._sweeps.close()
             raise ApplianceError(
-                f"the program has died {found.starts} times while candidate {candidate} ran beside "
-                f"it; remove {self._sweeps.folder / FILE} to try again"
+                f"the program has died {found.starts} times while candidate {candidate} ran next "
+                f"to it; remove {self._sweeps.folder / FILE} to try again"
             )
         found.starts, found.kept = found.starts + 1, len(self._sweeps.numbers)
         storage.put(self._sweeps.folder / FILE, found.json())

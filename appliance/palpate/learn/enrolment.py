@@ -181,7 +181,7 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
     spread = away.sum() / max(1, n - 1)
     if spread <= means.loose:
         return ""
-    usual = f"those of a trained material {r}, limit {means.loose:.1f}"
+    usual = f"a trained material has {r}, limit {means.loose:.1f}"
     return (
         f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; {usual}"
         f"), number {away.argmax() + 1} most of all; take others"

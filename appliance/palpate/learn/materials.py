@@ -100,7 +100,7 @@ def taught(
         disagreements += [made.disagreement] if made.disagreement else []
     if made is None:
         name = f"{new.manifest.name} {new.manifest.version}"
-        raise BundleError(f"bundle {name} gets no new material; record one that it does not have")
+        raise BundleError(f"bundle {name} gets no new material; record a material that it lacks")
     warnings = [*dict.fromkeys(warnings)]
     return replace(made, warnings=tuple(warnings), disagreement="; ".join(disagreements))
 

@@ -297,7 +297,7 @@ class TeachingSession(Observer):
         number = self.taken(label)
         if label not in self.materials() and not number:
             raise ApplianceError(
-                f"there is no material {label!r} to forget; name one that was recorded"
+                f"there is no material {label!r} to forget; name a recorded material"
             )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")

@@ -124,7 +124,7 @@ def _speed(manifest: Manifest) -> str:
         return f"not measured: {meter.why}"
     measured = f"measured from {meter.slowest_mm_s:.3g} to {meter.fastest_mm_s:.3g} mm/s"
     if trained is None:
-        return f"{measured}; the bundle does not state those of training: export it again"
+        return f"{measured}; the bundle does not state the trained speeds: export it again"
     return f"{measured}, trained {trained}"
 
 

@@ -1,4 +1,4 @@
-"""The script of `palpate demo`: sweeps over tubes, and on purpose what a box meets besides them: a
+"""The script of `palpate demo`: sweeps over tubes, and on purpose other things that a box meets: a
 stuck taxel, a material that nobody taught, a sweep over two materials, a cable that is pulled."""
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotDevices(Devices):
-    """Simulated GPIO lines with the robot that acts on them, which keeps what it played."""
+    """Simulated GPIO lines and the robot that drives them and keeps its played acts."""
 
     gpio: gpio.SimGpio
     robot: rig.Robot

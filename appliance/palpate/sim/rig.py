@@ -50,7 +50,7 @@ class Act:
     which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame.
     lifted: frames before the finger touches.
 
-    about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
+    about: a remark for a person. wanted: the right status; "" for `ok`, or
     `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
     skin is unplugged; None for none.
     """

@@ -76,7 +76,7 @@ class SweepCheck(Observer):
         """Nothing: no robot waits for these answers."""
 
     def _slid(self, sweep: Sweep, unchecked: str) -> Finding:
-        """The finding on a sweep without a fault. unchecked: what was not checked so far."""
+        """The finding on a sweep without a fault. unchecked: checks left out so far, in words."""
         assert self._slides
         if self._teaching and (alone := self._alone(sweep.frames.taxels)) is not None:
             return Finding(Status.NO_SLIDE, Remark(Reason.NOT_A_SLIDE, {"why": alone}))

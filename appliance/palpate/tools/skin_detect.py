@@ -282,5 +282,5 @@ def on_usb(config: SkinConfig) -> list[str]:
         return []
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     return [
-        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: its ids are those of skin.usb" for d in found
+        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: it has the ids of skin.usb" for d in found
     ]

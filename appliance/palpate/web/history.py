@@ -29,7 +29,7 @@ ROWS = 200
 
 class History:
     """Verdicts of the file at `path`. shifts: when shifts begin, such as "06:00 14:00 22:00", in
-    this computer's zone. Raises ConfigError if these are no times."""
+    this computer's zone. Raises ConfigError if they cannot be read."""
 
     def __init__(self, path: Path, shifts: str) -> None:
         self._path, self._own = path, VerdictFile(None, most_mib=OWN_MIB)
@@ -51,9 +51,9 @@ class History:
             raise FormatError(f"a verdict of the feed is of another version ({e!r}); update") from e
 
     def counted(self, period: str) -> dict[str, Any]:
-        """What a page shows of a period. from_s: its begin, seconds since 1970. kept_s: since when
-        verdicts are kept, null for all of the period. trend: see verdicts.trend. counts: of each
-        status and label. Or `why` nothing can be read."""
+        """The figures of a period for a page. from_s: its begin, seconds since 1970. kept_s: since
+        when verdicts are kept, null for all of the period. trend: see verdicts.trend. counts: of
+        each status and label. Or `why` nothing can be read."""
         source, days = self._source(), int(period)
         from_s, span_s = self._begin_s(days), SPAN_S.get(days, verdicts.DAY_S)
         now_s = wall_clock.seconds()

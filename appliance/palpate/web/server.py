@@ -262,7 +262,7 @@ class LimitedServer(HTTPServer):
         self.admitted: WeakSet[Any] = WeakSet()
 
     def handle_stream(self, stream: Any, address: Any) -> None:
-        """Accept a connection, and close another if there is no room."""
+        """Accept a connection, and close another if the server is full."""
         self._open = [one for one in self._open if not one.closed()]
         if len(self._open) >= MOST_OPEN:
             waiting = (one for one in self._open if one not in self.admitted)

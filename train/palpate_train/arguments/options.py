@@ -103,7 +103,7 @@ def writable_file(path: Path, option: str = "--out", *endings: str) -> None:
         raise FormatError(f"{option} {path} is a folder; name a file")
     if endings and path.suffix.lower() not in ("", *endings):
         raise FormatError(
-            f"{option} {path} would not be a {path.suffix} file; name one that ends in "
+            f"{option} {path} would not be a {path.suffix} file; use a name that ends in "
             f"{' or '.join(endings)}"
         )
     writable(path, option)

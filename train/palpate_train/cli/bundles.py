@@ -58,7 +58,7 @@ _EXPORT: tuple[Row, ...] = (
     _rules("--without", "left_out", "leave these rules out"),
     ("--licence", "of the recordings, for card.md: CC-BY-4.0", text("NAME", "")),
     above_zero("--stranger-cost", "N", "cost of an unknown material that gets a"
-        " label, as a multiple of that of a known one that gets none (1)", default=1.0),
+        " label, as a multiple of the cost of a known one without a label (1)", default=1.0),
 )
 # fmt: on
 

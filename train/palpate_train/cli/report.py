@@ -35,7 +35,7 @@ def register(add: Add) -> None:
         ("--out", None, path("FILE.html", required=True)),
         options.JSON,
         ("--train", "the set it was fitted to, for a learning curve, and to leave each material out"
-            " (those of a FIT)", text("SET", action="append", default=[])),
+            " (the recordings of a FIT)", text("SET", action="append", default=[])),
         ("--quick", "train nothing: no learning curve, no material left out", FLAG),
         EFFORT, *WHERE,
     )

@@ -20,7 +20,7 @@ from palpate_train.evaluate import set_warnings
 _PULL: tuple[Row, ...] = (
     ("host", "as for ssh: user@box", {"metavar": "HOST"}),
     ("--from", f"on the box ({pull.FOLDER})", text("DIR", pull.FOLDER, dest="folder")),
-    options.folder("here; its folders are those of the box"),
+    options.folder("here; with the same folders as on the box"),
     ("--port", "of the box's sshd", text("N", type=int)),
     ("--ssh-option", "as for ssh -o, e.g. User=pi", text("OPTION", action="append", default=[])),
 )

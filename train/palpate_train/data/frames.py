@@ -185,7 +185,7 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
         return None, _dates(name, table.labels[name])
     if values.ndim != 2 or (not table.columns and table.beside and not RANGE.fullmatch(name)):
         raise FormatError(
-            f"has no times {name!r}; beside the frames it has "
+            f"has no times {name!r}; next to the frames it has "
             f"{', '.join(table.beside) or 'nothing'}"
         )
     (at,) = column_numbers(name, table.columns, values.shape[1], "--time", 1)

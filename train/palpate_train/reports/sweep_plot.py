@@ -141,7 +141,7 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
     sweep, about = one.sweep, one.about
     if not len(sweep.frames):
         raise FormatError(
-            f"{one.path}: has no frames, its status is {sweep.status}; choose one that is ok"
+            f"{one.path}: has no frames, its status is {sweep.status}; choose another sweep"
         )
     named = [f"{by} {name}" for by in readers.NAMED_GROUPS if (name := getattr(sweep, by))]
     notes = [f"{one.path.name}, sweep {sweep.id}: {sweep.status}", str(one.format)]

@@ -13,7 +13,7 @@ function begin() { Object.assign(seen, {finished: false, key: "", recording: nul
 
 export function live() { return seen.reached === true && seen.recording !== null; }
 
-/* Whether this browser's token allows orders: those of a recording, or those of teaching too. */
+/* Whether this browser's token allows orders: of a recording, or of teaching too. */
 export function may(role = "operate") { return live() && (seen.role === "teach" || seen.role === role); }
 
 /* How long ago something was, by the box's clock. */

@@ -1,4 +1,4 @@
-/* The page on a tablet beside the robot: the whole screen, a screen that stays on, a tone on a refusal, and keys. */
+/* The page on a tablet at the robot: the whole screen, a screen that stays on, a tone on a refusal, and keys. */
 
 import {byId, made, put} from "./parts.js";
 

@@ -13,7 +13,7 @@ const SKINS = {
   silent: ["Skin silent", "it sends nothing, check its cable"],
   busy: ["Skin in use", "another program uses it"],
   denied: ["Skin refused", "the box may not open it, call a technician"],
-  mismatch: ["Wrong skin", "connect the one that was taught"],
+  mismatch: ["Wrong skin", "connect the skin that was taught"],
 };
 
 export function skin(state) { return SKINS[state] ?? [`Skin ${state}`, "call a technician"]; }
@@ -43,7 +43,7 @@ function of(sweep, now) { return `sweep ${sweep.sweep}, ${clock(sweep.at)}, ${ag
 function before(last, now) { return last ? `Before that: ${last.name || last.status}, ${of(last, now)}.` : ""; }
 
 /* What the card shows. verdict: the last one with its time `at`, in ms; fresh: whether it is of the program that runs now. swept: whether
-   it is of a sweep before the one that is open now. away: why nothing is heard, with lastAt (0: unknown); null where the box is heard. */
+   it is of a sweep before the open sweep. away: why nothing is heard, with lastAt (0: unknown); null where the box is heard. */
 export function card({verdict, fresh, swept, health, windowS, away, detail, lastAt, now}) {
   if (away !== null) {
     const since = lastAt ? `Last heard at ${clock(lastAt)}, ${ago(now - lastAt)} ago.` : "";

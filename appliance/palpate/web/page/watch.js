@@ -1,4 +1,4 @@
-/* The pages of palpate watch: the start; beside the robot the last verdict first, then the skin, the sweep, the shift, and the box
+/* The pages of palpate watch: the start; at the robot the last verdict first, then the skin, the sweep, the shift, and the box
    itself; the alignment of the skin; the history. */
 
 import {listen} from "./events.js";
@@ -167,7 +167,7 @@ function drawWords() {
   }
 }
 
-/* The sweep that is looked at: the one that was chosen, else the last. */
+/* The sweep that is looked at: the chosen sweep, else the last. */
 function looked() { return known.verdicts.find((one) => key(one) === known.chosen) ?? last(known.verdicts); }
 
 function drawSweep() {

@@ -56,7 +56,9 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     if path.suffix.lower() == ".db3":
         source = path.parent
         if not (source / "metadata.yaml").exists():
-            raise FormatError("lacks metadata.yaml beside it; run `ros2 bag reindex` on its folder")
+            raise FormatError(
+                "lacks metadata.yaml next to it; run `ros2 bag reindex` on its folder"
+            )
     kind = path.suffix.lower()
     if not WHOLE.get(kind, lambda _: True)(path):
         raise FormatError(f"has no end, as if it was cut off; {MENDED[kind]} makes it whole")

@@ -86,6 +86,6 @@ def _values(name: str, kind: re.Match[str], head: dict[str, str], texts: list[st
         else:
             numbers = numbers.reshape(())
     except (ValueError, ArithmeticError, KeyError) as e:
-        raise FormatError(f"{name}: its numbers are not those of its head: {e}") from e
+        raise FormatError(f"{name}: its numbers do not fit its head: {e}") from e
     dtype = np.bool_ if kind["bool"] else np.float32 if kind["float"] else kind["int"] or np.float64
     return numbers.astype(dtype)

@@ -39,7 +39,7 @@ def _table(group: Any) -> Table:
     if 2 * of_all <= len(kept):
         raise FormatError(
             f"its channels differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}; "
-            "save those of the skin as a group"
+            "save the skin's channels as a group"
         )
     notes = [
         f"{k} is left out: it has {n} values, not {usual}" for k, n in lengths.items() if n != usual

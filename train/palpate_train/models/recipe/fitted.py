@@ -210,7 +210,7 @@ class Fit:
             with_head(fit.trunk(), *fit.int8_head())
         except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:
             raise FormatError(
-                f"{name}: its weights are not those of its {fit.architecture}; fit again"
+                f"{name}: its weights do not fit its {fit.architecture}; fit again"
             ) from e
         return fit
 
