@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,16 @@ from palpate.core.config import ClassifierConfig
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
+Array = NDArray[Any]
+
 STRONG = 10.0
 """Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 6
 compares it with other rules."""
+UNLIKE = 0.8
+"""Largest difference of the distances of two sweeps of one object, see `unlike`. It parts up to
+0.7 % of known sweeps in ten sets, 1.2 % in one, and as many are answered. Of strangers after a
+known fabric without NEW OBJECT 16 and 19 % become surer than alone, in place of 24 and 30 %. With
+0.5 it is 13 and 14 %, and 1.3 points fewer are answered in one set."""
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
 all others."""
@@ -112,13 +119,14 @@ class FusedSweeps:
 
     object: its number, as in Sweep; 0 before the first NEW OBJECT. evidence: of the fused sweeps.
     last, end_ns: number and end of the last sweep that had probabilities, whether it was fused or
-    refused.
+    refused. far: as of Context, of the last fused sweep.
     """
 
     object: int = 0
     evidence: Evidence | None = None
     last: int = 0
     end_ns: int = 0
+    far: Array = field(default_factory=lambda: np.empty(0))
 
     def ended(self, start_ns: int, rule: ClassifierConfig) -> bool:
         """Whether a sweep that starts at `start_ns` comes after a pause, or after `max_sweeps`
@@ -140,6 +148,12 @@ def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
     return bool(len(own) * (fused @ own) < 1 / STRONG)
 
 
+def unlike(far: Array, last: Array) -> bool:
+    """Whether a sweep is of another object than the last one, by their distances [K] (Context.far),
+    though its label may be the same: a stranger lies elsewhere. An unfinished sweep has none."""
+    return bool(len(far) and len(last) and ((far - last) ** 2).mean() > UNLIKE**2)
+
+
 class ObjectSweeps:
     """Fuses the sweeps of one object after the other. labels: [K], for messages. rule: how they are
     fused, and when an object ends."""
@@ -157,7 +171,7 @@ class ObjectSweeps:
         if sweep.object == 0 or sweep.object != earlier.object or self.rule.fuse == "none":
             earlier = FusedSweeps(sweep.object)
         before = None if earlier.ended(sweep.start_ns, self.rule) else earlier.evidence
-        conflict = self._conflict(own, before)
+        conflict = self._conflict(context, before, earlier.far)
         context.own, context.after = own, earlier.last
         if conflict and self.rule.conflict == "refuse":
             self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
@@ -168,20 +182,20 @@ class ObjectSweeps:
             self.rule.fuse,
             None if conflict else before,
         )
-        self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
+        self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns, context.far)
         fused = kept.probabilities
         context.scores = fused if votes else self.enrolled.decided(fused)
         context.fused, context.remark = kept.sweeps, conflict
         context.final = 0 < self.rule.max_sweeps <= kept.sweeps
         return None
 
-    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> Remark | None:
-        """A remark if `own` [K] contradicts the sweeps `before`; None if it can be fused with
-        them."""
+    def _conflict(self, context: Context, before: Evidence | None, far: Array) -> Remark | None:
+        """A remark if the sweep contradicts the sweeps `before` with the distances `far`, or is
+        unlike them; None if it can be fused with them."""
         if not before or self.rule.conflict == "fuse":
             return None
-        fused = before.probabilities
-        if not contradicts(own, fused):
+        own, fused = context.probabilities, before.probabilities
+        if not (contradicts(own, fused) or unlike(context.far, far)):
             return None
         label, before_it = (
             self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)

@@ -72,10 +72,11 @@ class Context:
     frames of the window are there. mean: counts of the checked window, in the shape of a frame.
     full: share of its counts at full scale. degraded: the broken taxels that were bridged, None
     for none. hum: amplitude that was removed, in counts. disturbed: values of the disturbances by
-    name. logits, embedding: [K], [r], of the network. probabilities: float64 [K], of this sweep.
-    own: the same, of a sweep that belongs to an object. scores: float64 [K], of all `fused` sweeps
-    of the object. after: as in Verdict. final: no further sweep of the object is wanted. status,
-    remark: of the answer.
+    name. logits, embedding: [K], [r], of the network. far: float32 [K], of a contact in place: the
+    log of 1 + the squared distance to each label in units of the limit. probabilities: float64 [K],
+    of this sweep. own: the same, of a sweep that belongs to an object. scores: float64 [K], of all
+    `fused` sweeps of the object. after: as in Verdict. final: no further sweep of the object is
+    wanted. status, remark: of the answer.
     """
 
     sweep: Sweep
@@ -93,6 +94,7 @@ class Context:
     disturbed: Mapping[str, float] = field(default_factory=dict)
     logits: Array = field(default_factory=_none)
     embedding: Array = field(default_factory=_none)
+    far: Array = field(default_factory=_none)
     probabilities: NDArray[np.float64] = field(default_factory=_none)
     own: NDArray[np.float64] = field(default_factory=_none)
     scores: NDArray[np.float64] = field(default_factory=_none)

@@ -278,11 +278,10 @@ class ClassDistances:
         logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)
         return np.asarray(logits, np.float32)
 
-    def novelty(
+    def measured(
         self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED
-    ) -> dict[str, Any] | None:
-        """The distance to the nearest label, and the limit, if it is beyond the limit; None for a
-        known material.
+    ) -> tuple[NDArray[np.float32], float]:
+        """Squared distances [K] to the labels, and the limit that they are compared with.
 
         embedding: [r]. disturbed: values of the sweep's disturbances by name. Each material has
         its own scatter. The embedding was optimised for trained labels, so the distance to an
@@ -296,11 +295,7 @@ class ClassDistances:
             away -= np.array(sizes, np.float32).dot(changes)
             limit *= self._disturbances.growth(sizes)
         away = away.reshape(len(self.labels), -1)
-        scaled = np.vecdot(away, away)
-        k = int(scaled.argmin())
-        if scaled[k] <= limit:
-            return None
-        return {"distance": float(scaled[k]), "label": self.labels[k], "limit": limit}
+        return np.vecdot(away, away), limit
 
     def apart(self, embedding: NDArray[Any], others: NDArray[Any]) -> Array:
         """Half of the squared distance [n] of an embedding [r] from others [n, r], with the mean
@@ -337,9 +332,13 @@ class KnownMaterial:
         means = self._displaced if off and self._displaced else self._means
         z = context.embedding
         context.logits = means.joined(context.logits, z)
-        novelty = means.novelty(z, context.disturbed)
-        if novelty is None:
+        far, limit = means.measured(z, context.disturbed)
+        if not off:
+            context.far = np.log1p(far / limit)
+        k = int(far.argmin())
+        if far[k] <= limit:
             return None
+        novelty = {"distance": float(far[k]), "label": means.labels[k], "limit": limit}
         # a golden sweep has no number, and nobody touched it
         if not off and context.sweep.id and (alike := self._keep(context.sweep.id, z)):
             again = Remark(Reason.UNLIKE_ALL_AGAIN, novelty | {"sweep": alike})

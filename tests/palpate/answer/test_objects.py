@@ -25,6 +25,8 @@ from tests.factories.toy_bundle import told
 
 A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 """Embeddings of a sure "a", a sure "b", and an "a" with a probability of .65."""
+BELOW, ASIDE = (0.0, -2.9), (0.0, 2.9)
+"""A sure "a" that is far from "c", and an "a" with a probability of .57 between them."""
 S = 1_000_000_000
 ANOTHER = "another object: "
 DELIVERED = ClassifierConfig()
@@ -100,6 +102,32 @@ def test_a_contradiction_begins_another_object(toy):
         ("ok", "a", 1, f"{ANOTHER}a after b"),
     ]
     assert labels(classifier(toy, fuse="vote"), A, A, B) == [("a", 1), ("a", 2), ("b", 1)]
+
+
+@pytest.mark.parametrize(
+    ("conflict", "given"),
+    [
+        ("new", ("ok", "a", 1, f"{ANOTHER}a after a")),
+        ("refuse", ("conflict", "", 0, f"{ANOTHER}a after a")),
+        ("fuse", ("ok", "a", 3, "")),
+    ],
+)
+def test_a_sweep_that_lies_elsewhere_is_not_made_surer(toy, conflict, given):
+    """It has the label of the object, but is as far from "a" on the other side, where "c" is. A
+    sweep with less difference is fused, and so is one after an unfinished one."""
+    it, (*_, alone) = classifier(toy, conflict=conflict), felt(ASIDE)
+    sweeps = felt(BELOW, BELOW, ASIDE)
+    *_, last = [it(sweep) for sweep in sweeps]
+    assert short(last) == given
+    own = classifier(toy)(alone).probability
+    assert own < 0.6
+    if conflict == "new":
+        assert last.probability == own
+        for between in (A, BELOW):
+            it.forget()
+            assert [it(one).fused for one in felt(BELOW, between)] == [1, 2]
+        it.judged(sweeps[1], told(it, np.array([0.9, 0.1, 0.0])))
+        assert it(sweeps[2]).fused == 4
 
 
 def test_an_unsure_sweep_is_fused(toy):
