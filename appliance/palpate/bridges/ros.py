@@ -58,11 +58,8 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 def values(fields: Mapping[str, Any]) -> list[KeyValue]:
     """Fields as texts: true and false in lower case, numbers as Python writes them, "" for None."""
-    texts = {name: "" if v is None else str(v) for name, v in fields.items()}
-    return [
-        KeyValue(key=name, value=text.lower() if isinstance(fields[name], bool) else text)
-        for name, text in texts.items()
-    ]
+    texts = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in fields.items()}
+    return [KeyValue(key=k, value="" if fields[k] is None else text) for k, text in texts.items()]
 
 
 def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
@@ -84,26 +81,21 @@ def box_status(view: BoxView, before: BoxView, *, alive: bool) -> DiagnosticStat
     """The state of the box: STALE if it is not heard, ERROR if its skin does not stream, WARN if
     anything was lost since `before`."""
     state = view.state
-    hurt = [
-        f"{count} {what}"
-        for count, what in (
-            (view.missed - before.missed, "answers did not arrive"),
-            (view.damaged - before.damaged, "sentences were damaged"),
-            (
-                state.lost_frames - before.state.lost_frames if state and before.state else 0,
-                "frames were lost",
-            ),
-        )
-        if count > 0
-    ]
+    counts = {
+        "answers did not arrive": view.missed - before.missed,
+        "sentences were damaged": view.damaged - before.damaged,
+    }
+    if state and before.state:
+        counts["frames were lost"] = state.lost_frames - before.state.lost_frames
+    hurt = ", ".join(f"{count} {what}" for what, count in counts.items() if count > 0)
     if not alive or state is None:
         level, text = DiagnosticStatus.STALE, view.trouble or "nothing is heard of the box"
     elif state.skin != "streaming":
         level, text = DiagnosticStatus.ERROR, f"the skin is {state.skin}"
+    elif hurt:
+        level, text = DiagnosticStatus.WARN, hurt
     else:
-        level, text = (
-            (DiagnosticStatus.WARN, ", ".join(hurt)) if hurt else (DiagnosticStatus.OK, "streaming")
-        )
+        level, text = DiagnosticStatus.OK, "streaming"
     fields = (asdict(state) | {"ready": state.ready}) if state else {}
     fields |= {"missed": view.missed, "damaged": view.damaged, "trouble": view.trouble}
     return DiagnosticStatus(

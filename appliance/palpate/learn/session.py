@@ -154,7 +154,7 @@ class TeachingSession(Observer):
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
             for name in (renamed, NOT_THIS):
                 wanted.pop(name, None)
-            for name in self._recording.forgotten - self.materials().keys() - {*labels}:
+            for name in {*self._recording.sweeps.forgotten} - self.materials().keys() - {*labels}:
                 if name not in self._trained:
                     wanted.pop(name, None)
             check_bits(self._codes, [*wanted])
@@ -192,7 +192,7 @@ class TeachingSession(Observer):
     def _assess(self) -> None:
         """Begin an assessment; a failure is shown."""
         try:
-            own = learning(self._recording.folder, self._settings)
+            own = learning(self._recording.sweeps.folder, self._settings)
             self._begin(self._learn("") if self._base else own)
         except ApplianceError as e:
             self._take({"type": "error", "text": str(e)})
@@ -345,7 +345,7 @@ class Teacher(Observer):
             self._wanted[label] = self._session.taken(label) + self._sweeps
             self._ask(label)
             return
-        self._recording.settle()
+        self._recording.disk.settle()
         if again := self._lacks(self._wanted):
             self._ask(again[0])
         else:

@@ -60,7 +60,8 @@ def box(
     """The box that classifies; `stack` closes it again. more: as for `assembled`."""
     run = Classifier(bundle, devices.clock, settings.classifier)
     run.self_test()
-    more |= {"codes": bundle.manifest.labels, "early": early_exit(settings, run)}
+    early = EarlyExit(run) if settings.classifier.early else None
+    more |= {"codes": bundle.manifest.labels, "early": early}
     return assembled(settings, run, devices, port, stack, **more)
 
 
@@ -177,15 +178,12 @@ def gpio(devices: Devices) -> Any:
     return gpiod
 
 
-def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
-    return EarlyExit(run) if settings.classifier.early else None
-
-
 def prove(settings: Config, bundle: Bundle) -> None:
     """Raises BundleError or ConfigError if this machine does not run a bundle correctly."""
     run = Classifier(bundle, SystemClock(), settings.classifier)
     run.self_test()
-    early_exit(settings, run)
+    if settings.classifier.early:
+        EarlyExit(run)
     if settings.output.class_bits:
         check_bits(1 << len(settings.output.class_bits), bundle.manifest.labels)
 

@@ -29,7 +29,6 @@ from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.deployment.release_trial import OTHERWISE
 from palpate.inference.classifier import RULE, Classifier, EarlyExit
 from palpate.io.robot_link import StdoutPort, result
-from palpate.runtime import assembly
 from palpate.runtime.loop import Box
 from palpate.sweeps.capture import Playback
 from palpate.sweeps.sweep_folder import RecordedSweep, number_of
@@ -168,21 +167,17 @@ class SweepReplay:
         sweep = kept.sweep if whole or fused == 1 else replace(kept.sweep, object=0)
         verdict, own = _answered(classifier, sweep)
         if not whole:
-            same = own.tolist() == was.get("own")
-            return ReplayResult(
-                verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there"
-            )
+            outcome = ALONE if own.tolist() == was.get("own") else DIFFERENT
+            return ReplayResult(verdict, outcome, "earlier sweeps of its object are not there")
         if verdict is None:
-            return ReplayResult(
-                verdict, DIFFERENT, "it was answered early, which this bundle does not do"
-            )
+            why = "it was answered early, which this bundle does not do"
+            return ReplayResult(verdict, DIFFERENT, why)
         if not (was and kept.bundle):  # recorded without a bundle
             return ReplayResult(verdict, SILENT)
         now = verdict.as_dict()
-        changed = [
-            _change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)
-        ]
-        return ReplayResult(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
+        changed = [_change(name, was[name], now.get(name)) for name in was]
+        text = ", ".join(filter(None, changed))
+        return ReplayResult(verdict, DIFFERENT if text else SAME, text)
 
     def _prepared(self, kept: KeptSweep) -> Classifier:
         """The classifier with the original settings, and the fused sweeps of this replay."""
@@ -198,6 +193,8 @@ class SweepReplay:
 
 
 def _change(name: str, was: object, now: object) -> str:
+    if was == now:
+        return ""
     return f"other {name}" if isinstance(was, list) else f"{name} {was!r} is now {now!r}"
 
 
@@ -304,9 +301,8 @@ def _with_earlier(path: Path) -> list[KeptSweep]:
     """The earlier sweeps of the object, then the sweep at `path`. Raises FormatError."""
     found = [KeptSweep.read(path)]
     if found[0].sweep.object:
-        for earlier in sorted(
-            (p for p in path.parent.glob("*.npy") if _order(p) < _order(path)), key=_order
-        )[::-1]:
+        before = (p for p in path.parent.glob("*.npy") if _order(p) < _order(path))
+        for earlier in sorted(before, key=_order, reverse=True):
             kept = KeptSweep.read(earlier)
             if kept.object != found[0].object:
                 break
@@ -342,7 +338,7 @@ def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
     cutter = SweepCutter(bundle.format, settings.sweep)
     box = Box(
         *(play, play, cutter, classifier, play),
-        early=assembly.early_exit(settings, classifier),
+        early=EarlyExit(classifier) if settings.classifier.early else None,
         port=port,
         observers=[classifier],
         source="replay",

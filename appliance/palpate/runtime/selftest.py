@@ -56,57 +56,44 @@ def check(
     """Check all components in turn, also after a failure; the skin also without a bundle. spent_ns:
     processor time that this thread has taken so far."""
     loaded: list[Bundle] = []
-    yield from _of_bundle(settings, load, devices, loaded, spent_ns)
-    if loaded:
-        yield CheckResult("speed", True, _speed(loaded[0].manifest))
-    yield _try(
-        "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
-    )
-    yield from _triggered(settings, devices)
-    if settings.serial.port:
-        yield _try("serial port", lambda: _port(settings, devices))
-
-
-def _of_bundle(
-    settings: Config,
-    load: Callable[[], Bundle],
-    devices: Devices,
-    loaded: list[Bundle],
-    spent_ns: Callable[[], int],
-) -> Iterator[CheckResult]:
-    """The bundle, which is put into `loaded`, and its golden sweeps."""
 
     def bundle() -> str:
         loaded.append(load())
-        m = loaded[0].manifest
-        enrolled = "".join(
-            f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items()
-        )
-        return (
-            f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}; "
-            + (f"{m.taught}; " if m.taught else "")
-            + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
-            + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
-            + (f"; {UNALLOWED}" if m.known and not m.disturbances else "")
-        )
-
-    def golden() -> str:
-        classifier = Classifier(loaded[0], devices.clock)
-        begun_ns = spent_ns()
-        worst = classifier.self_test()
-        each_ms = (spent_ns() - begun_ns) / 1e6 / len(loaded[0].golden)
-        if settings.classifier.early:
-            EarlyExit(classifier)
-        return (
-            f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}, "
-            f"{each_ms:.2g} ms of the processor for each"
-        )
+        return _described(loaded[0])
 
     yield _try("bundle", bundle)
     if settings.classifier.allow_unsigned:
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
-        yield _try("golden sweeps", golden)
+        yield _try("golden sweeps", lambda: _golden(loaded[0], settings, devices, spent_ns))
+        yield CheckResult("speed", True, _speed(loaded[0].manifest))
+    wanted = loaded[0].format if loaded else None
+    yield _try("skin", lambda: _skin(settings, wanted, devices, spent_ns))
+    yield from _triggered(settings, devices)
+    if settings.serial.port:
+        yield _try("serial port", lambda: _port(settings, devices))
+
+
+def _described(bundle: Bundle) -> str:
+    m = bundle.manifest
+    enrolled = "".join(f", {label} enrolled from {n}" for label, n in bundle.enrolled.items())
+    return (
+        f"{m.name} {m.version}, {bundle.id}, {m.format}, {len(m.labels)} labels{enrolled}; "
+        + (f"{m.taught}; " if m.taught else "")
+        + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
+        + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
+        + (f"; {UNALLOWED}" if m.known and not m.disturbances else "")
+    )
+
+
+def _golden(bundle: Bundle, settings: Config, devices: Devices, spent_ns: Callable[[], int]) -> str:
+    classifier, begun_ns, n = Classifier(bundle, devices.clock), spent_ns(), len(bundle.golden)
+    worst = classifier.self_test()
+    each_ms = (spent_ns() - begun_ns) / 1e6 / n
+    if settings.classifier.early:
+        EarlyExit(classifier)
+    worst_text = f"{n} sweeps, largest difference of a probability {worst:.2g}"
+    return f"{worst_text}, {each_ms:.2g} ms of the processor for each"
 
 
 def _try(component: str, look: Callable[[], str]) -> CheckResult:
@@ -220,10 +207,9 @@ def _lines(settings: Config, devices: Devices) -> str:
         closing(Lines(settings.output, module, devices.clock)) as lines,
     ):
         codes = lines.capacity
-    inputs = [
-        n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n
-    ]
-    return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
+    trigger = settings.trigger
+    inputs = " ".join(filter(None, (trigger.start, trigger.stop, trigger.new_object)))
+    return f"inputs {inputs}, outputs for {codes} codes"
 
 
 def _port(settings: Config, devices: Devices) -> str:

@@ -11,9 +11,9 @@ from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.types import SweepFormat
 from palpate.sim import gpio, rig, usb
+from palpate.sim.rig import NEW_OBJECT, START, STOP
 
 READY, BUSY, RESULT_VALID, FAULT, DECIDED = "READY", "BUSY", "RESULT-VALID", "FAULT", "DECIDED"
-START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
 BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 
@@ -67,8 +67,7 @@ def robot_on_lines(
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
     chips = {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}
     lines = gpio.SimGpio(clock, chips, remember=remember)
-    names = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
-    robot = rig.Robot(iter(acts), lines, **names, remember=remember, follows=follows)
+    robot = rig.Robot(iter(acts), lines, remember=remember, follows=follows)
     if stops:
         lines.watchers[DECIDED] = robot.react
     return robot, lines

@@ -21,6 +21,8 @@ from palpate.core.types import SweepFormat
 from palpate.io import packets
 from palpate.sim.gpio import SimGpio
 
+START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
+"""The lines that the robot drives."""
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
 SETTLED = 16
@@ -85,9 +87,6 @@ class Robot:
         script: Iterator[Act],
         lines: SimGpio,
         *,
-        start: str,
-        stop: str,
-        new_object: str = "",
         remember: bool = True,
         follows: bool = False,
     ) -> None:
@@ -100,7 +99,6 @@ class Robot:
         self.cable: Callable[[int, int], None] | None = None
         self._script, self._lines = script, lines
         self._playing: tuple[Act, int, Callable[[int], int]] | None = None
-        self._start, self._stop, self._new_object = start, stop, new_object
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
         """Begin the next act with frame `first`, schedule its edges and return it; None when the
@@ -113,14 +111,10 @@ class Robot:
             return None
         self.acts += 1
         self.played.append(act)
-        begin_ns, start_ns, stop_ns = (frame_ns(first + i) for i in (0, act.start, act.stop))
-        if act.new_object and self._new_object:
-            self._pulse(self._new_object, begin_ns, begin_ns + PULSE_NS)
-        if self._stop:
-            self._pulse(self._start, start_ns, start_ns + PULSE_NS)
-            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
-        else:
-            self._pulse(self._start, start_ns, stop_ns)
+        if act.new_object:
+            self._pulse(NEW_OBJECT, frame_ns(first))
+        self._pulse(START, frame_ns(first + act.start))
+        self._pulse(STOP, frame_ns(first + act.stop))
         if act.unplugged and self.cable:
             self.cable(*(frame_ns(first + i) for i in act.unplugged))
         self._playing = act, first, frame_ns
@@ -136,16 +130,12 @@ class Robot:
             return
         self._playing = None
         stop_ns = frame_ns(first + at)
-        self._lines.forget(self._stop or self._start, stop_ns)
-        if self._stop:
-            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
-        else:
-            self._lines.drive(self._start, False, stop_ns)
+        self._lines.forget(STOP, stop_ns)
+        self._pulse(STOP, stop_ns)
         self.skipped = first + at, first + act.stop
         if self.played:
-            self.played[-1] = replace(
-                act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at
-            )
+            frames = np.delete(act.frames, slice(at, act.stop), axis=0)
+            self.played[-1] = replace(act, frames=frames, stop=at)
 
     def obey(self, t_ns: int, *, start: bool) -> None:
         """START or STOP has come at `t_ns`: a waiting finger slides, or is lifted."""
@@ -181,9 +171,9 @@ class Robot:
             return act.part(slice(act.stop, None))
         return act.part(slice(max(1, min(act.lifted, WAITING))))
 
-    def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
-        self._lines.drive(name, True, up_ns)
-        self._lines.drive(name, False, down_ns)
+    def _pulse(self, name: str, at_ns: int) -> None:
+        self._lines.drive(name, True, at_ns)
+        self._lines.drive(name, False, at_ns + PULSE_NS)
 
 
 class Film:

@@ -61,8 +61,8 @@ class RecordingSession(Observer):
     say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
     is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
     earlier runs in the folder count. names: of materials that were typed; names of earlier sweeps
-    are added; sidecars keep them. Raises ConfigError if the folder cannot be used, or has
-    sweeps of another format.
+    are added; sidecars keep them. sweeps: the folder. Raises ConfigError if it cannot be used, or
+    has sweeps of another format.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class RecordingSession(Observer):
         names: TypedNames | None = None,
     ) -> None:
         self.names = names or TypedNames()
-        self._disk = disk or AtOnce()
+        self.disk = disk or AtOnce()
         # each sweep that is not put yet: its material, and whether it will count
         self._writing: dict[int, tuple[str, bool]] = {}
         try:
-            self._folder = SweepFolder(folder, format)
+            self.sweeps = SweepFolder(folder, format)
         except OSError as e:
             raise (TemporaryError if passes(e) else ConfigError)(
                 f"--out {folder}: {e.strerror}; name a folder that can be written"
@@ -119,15 +119,6 @@ class RecordingSession(Observer):
         return self._stored[-1] if self._stored else None
 
     @property
-    def folder(self) -> Path:
-        return self._folder.folder
-
-    @property
-    def forgotten(self) -> set[str]:
-        """Materials that were forgotten, also if sweeps of them were recorded again."""
-        return {*self._folder.forgotten}
-
-    @property
     def undoes(self) -> tuple[str, str]:
         """The name that UNDO would take away, and the former name; ("", "") if it undoes none."""
         return self._undo[-1].names if self._undo else ("", "")
@@ -138,10 +129,7 @@ class RecordingSession(Observer):
 
     def awaited(self, sweep: Sweep) -> tuple[int, str]:
         """The number and material that a sweep will have in the folder."""
-        return self._folder.run + sweep.id, self._labels_of(sweep).material
-
-    def path(self, number: int) -> Path:
-        return self._folder.path(number)
+        return self.sweeps.run + sweep.id, self._labels_of(sweep).material
 
     def materials(self) -> dict[str, int]:
         """The number of sweeps in the folder of each material, without forgotten ones."""
@@ -158,10 +146,6 @@ class RecordingSession(Observer):
         if not self._writing:
             return act()
         return self._beside(lambda: None, act, what, "try again")
-
-    def settle(self) -> None:
-        """Wait until all sweeps are written, for some seconds at most."""
-        self._disk.settle()
 
     def refuse_while_changing(self) -> None:
         """Raises ApplianceError while such a change is not on the disk yet."""
@@ -189,7 +173,7 @@ class RecordingSession(Observer):
                 self.leave_out(number)
             return done()
 
-        write = partial(self._folder.forget, material, numbers)
+        write = partial(self.sweeps.forget, material, numbers)
         return self._beside(write, forgotten, f"{material!r} cannot be forgotten", "make room")
 
     def _beside(
@@ -220,7 +204,7 @@ class RecordingSession(Observer):
                 reply.set_exception(refused)
 
         self._changes += 1
-        if not self._disk(tried, end):
+        if not self.disk(tried, end):
             self._changes -= 1
             raise ApplianceError(f"{what}: too much waits for the disk; try again")
         return reply.result() if reply.done() else reply
@@ -242,7 +226,7 @@ class RecordingSession(Observer):
             "target": self._progress.target,
             "missing": self._progress.missing(),
             "last": self._last,
-            "discard": None if self.last is None else self.last - self._folder.run,
+            "discard": None if self.last is None else self.last - self.sweeps.run,
             "newest": self._newest(),
             "undo": self._undo[-1].what if self._undo else "",
         }
@@ -257,23 +241,23 @@ class RecordingSession(Observer):
         labels = self._labels_of(sweep)
         sweep = replace(sweep, **entries(labels))
         counts = bool(len(sweep.frames)) and not verdict.status.faulty
-        self._writing[self._folder.run + sweep.id] = labels.material, counts
+        self._writing[self.sweeps.run + sweep.id] = labels.material, counts
         report = partial(self._report_outcome, sweep, verdict, labels)
-        if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
+        if not self.disk(partial(self._write, sweep, verdict, circumstances), report):
             report(("failed", "the disk is too slow"))
 
     def _report_outcome(
         self, sweep: Sweep, verdict: Verdict, labels: Labels, written: tuple[str, str] | int
     ) -> None:
         """Count, log and send the outcome of a sweep. written: as returned by `_write`."""
-        self._writing.pop(self._folder.run + sweep.id)
+        self._writing.pop(self.sweeps.run + sweep.id)
         if isinstance(written, int):
             outcome, detail = "stored", self._count_stored(written, labels, verdict.status)
         else:
             outcome, detail = written
         if len(sweep.frames):
             trouble = "" if outcome == "stored" else outcome
-            self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
+            self._log.update(trouble, _report(outcome, sweep.id, detail, self.sweeps.folder))
         self._tell(verdict, outcome, labels)
         self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **entries(labels)}
         said = outcome, self.stored, labels.material, labels.position, labels.session, detail
@@ -281,27 +265,27 @@ class RecordingSession(Observer):
 
     def close(self) -> None:
         """Finish writing, release the folder, and log the number of stored sweeps."""
-        self._disk.settle()
-        self._folder.close()
+        self.disk.settle()
+        self.sweeps.close()
         if self._answered:
-            where = f"record: sweeps of this run in {self._folder.folder}: {self.stored}"
+            where = f"record: sweeps of this run in {self.sweeps.folder}: {self.stored}"
             log.info(f"{where}; {self._progress.missing()}")
 
     def _count_earlier(self, format: SweepFormat) -> None:
         """Count the sweeps of earlier runs. Raises ConfigError for another format."""
-        for number, about in self._folder.sidecars():
-            path = self._folder.path(number)
+        for number, about in self.sweeps.sidecars():
+            path = self.sweeps.path(number)
             try:
                 Status(about["verdict"]["status"])
                 labels, stored = _labels(about), about["format"]
             except (ConfigError, KeyError, TypeError, ValueError):
                 continue  # not a sweep of ours: training reports it
             if stored != format.json():
-                self._folder.close()
+                self.sweeps.close()
                 raise ConfigError(
                     f"{path} has another format than {format}; name another folder with --out"
                 )
-            gone = self._folder.is_forgotten(number, labels.material)
+            gone = self.sweeps.is_forgotten(number, labels.material)
             self._count(number, labels, exclusion(about, forgotten=gone))
             self.names.add(labels.material, about.get("display"))
 
@@ -326,24 +310,24 @@ class RecordingSession(Observer):
         if not len(sweep.frames):
             return "skipped", f"{verdict.status}"
         try:
-            disk = os.statvfs(self._folder.folder)
+            disk = os.statvfs(self.sweeps.folder)
             least = min(LEAST_FREE[0] // disk.f_frsize, disk.f_blocks // LEAST_FREE[1])
             if disk.f_bavail < least:
                 left, wanted = (n * disk.f_frsize / 1e6 for n in (disk.f_bavail, least))
                 return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
             display = self.names.displays.get(sweep.material or "")
             about = {**circumstances, "display": display} if display else circumstances
-            return self._folder.put(sweep, verdict, about)
+            return self.sweeps.put(sweep, verdict, about)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
 
     def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
         """Count a stored sweep; its file's name with remarks, for a person."""
         self._stored.append(number)
-        gone = "forgotten" * self._folder.is_forgotten(number, labels.material)
+        gone = "forgotten" * self.sweeps.is_forgotten(number, labels.material)
         self._count(number, labels, str(status) if status.faulty else gone)
         fault = f" {status}" if status.faulty else ""
-        return self._folder.path(number).stem + fault + " no material" * (not labels.material)
+        return self.sweeps.path(number).stem + fault + " no material" * (not labels.material)
 
     def _labels_of(self, sweep: Sweep) -> Labels:
         """The labels that applied at its start edge."""
@@ -371,10 +355,10 @@ class RecordingSession(Observer):
         self.refuse_while_changing()
         if (number := self.last) is None:
             raise ApplianceError("no sweep of this run is left to discard; record one first")
-        shown = number - self._folder.run
+        shown = number - self.sweeps.run
         if which and which != str(shown):
             raise ApplianceError(f"the last stored sweep is {shown}, not {which}; look at it first")
-        remove = partial(self._folder.remove, number, reserve=True)
+        remove = partial(self.sweeps.remove, number, reserve=True)
         gone = partial(self._discarded, number, shown)
         return self._beside(remove, gone, f"sweep {shown} cannot be discarded", "look at the disk")
 
@@ -384,7 +368,7 @@ class RecordingSession(Observer):
         self.leave_out(number)
         if self._last and self._last["sweep"] == shown:
             self._last["outcome"] = "discarded"
-        return [shown, self.stored, self._folder.path(number).stem]
+        return [shown, self.stored, self.sweeps.path(number).stem]
 
     def _move(self, text: str) -> Reply:
         """Move a sweep to another material; returns both. text: the number of its file, the
@@ -448,11 +432,11 @@ class RecordingSession(Observer):
                 if labels := self._counted.get(number):
                     self.leave_out(number)
                     self._count(number, replace(labels, material=label), "")
-                if self._last and self._last["sweep"] == number - self._folder.run:
+                if self._last and self._last["sweep"] == number - self.sweeps.run:
                     self._last = self._last | {"material": label}
             return done()
 
-        write = partial(self._folder.relabel, materials, dict(self.names.displays))
+        write = partial(self.sweeps.relabel, materials, dict(self.names.displays))
         return self._beside(write, moved, "the other material is not kept", "look at the disk")
 
     def _call(self, old: str, new: str) -> None:

@@ -134,7 +134,7 @@ class SlidesBefore:
             of.setdefault(material, []).append(number)
         for number in (n for numbers in of.values() for n in numbers[-PEERS:]):
             with suppress(FormatError):  # damaged: training reports it
-                sweep = RecordedSweep.load(recording.path(number)).sweep
+                sweep = RecordedSweep.load(recording.sweeps.path(number)).sweep
                 self._slid[number] = self._judge.measured(sweep.frames.taxels)
 
     def __call__(self, sweep: Sweep) -> SlideFinding:

@@ -494,14 +494,13 @@ def test_a_set_is_played_so_that_early_answers_see_it(tmp_path):
         assert (act.start + act.stop) // 2 - 50 == first
 
 
-@pytest.mark.parametrize("stop", ["STOP", ""])
-def test_the_simulated_robot_stops_once(stop):
-    """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction,
-    frames are omitted. DECIDED just before the end of a slide changes nothing."""
+def test_the_simulated_robot_stops_once():
+    """Scheduled edges are cancelled, the stop edge comes after the reaction, frames are omitted.
+    DECIDED just before the end of a slide changes nothing."""
 
     def started() -> tuple[rig.Robot, gpio.SimGpio]:
         lines = gpio.SimGpio(rig.VirtualClock(0), {"/dev/gpiochip0": ["START", "STOP"]})
-        return rig.Robot(iter(acts(slid(60))), lines, start="START", stop=stop), lines
+        return rig.Robot(iter(acts(slid(60))), lines), lines
 
     robot, lines = started()
     robot.react(0)
@@ -512,8 +511,7 @@ def test_the_simulated_robot_stops_once(stop):
     robot.react(start_ns + 400_000_000)
     assert robot.skipped == (100 + 40 + 32, 100 + 40 + SLIDE)
     planned = sorted((t_ns - start_ns, name, level) for t_ns, _, name, level in lines._plan)
-    two = [(320_000_000, "STOP", True), (340_000_000, "STOP", False)]
-    assert planned[2 if stop else 1 :] == (two if stop else [(320_000_000, "START", False)])
+    assert planned[2:] == [(320_000_000, "STOP", True), (340_000_000, "STOP", False)]
     assert (robot.played[0].stop, len(robot.played[0].frames)) == (72, 40 + 32 + 40)
     robot, _ = started()
     robot.next_act(0, lambda i: i * 10_000_000)

@@ -36,7 +36,7 @@ def board(what: Skin, clock: Clock) -> rig.ReadoutBoard:
         what.rows, what.cols, what.rate_hz, skin.FORMAT.window, what.dtype, what.axes
     )
     act = rig.Act(numbered(_LENGTH, format), 10**9, 10**9 + 1, "")
-    robot = rig.Robot(repeat(act), Nowhere(), start="", stop="")
+    robot = rig.Robot(repeat(act), Nowhere())
     made = rig.ReadoutBoard(
         format, robot, clock, serial=what.serial, fifo_frames=round(_FIFO_S * what.rate_hz)
     )
