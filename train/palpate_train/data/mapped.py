@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,6 +43,15 @@ def is_mapped(samples: Array) -> bool:
     return isinstance(base, mmap.mmap)
 
 
+def header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """The shape of an .npy, whether its first axis runs fastest, and its type. Raises ValueError
+    for another file."""
+    version = FORMAT.read_magic(file)
+    read = FORMAT.read_array_header_1_0 if version == (1, 0) else FORMAT.read_array_header_2_0
+    found: tuple[tuple[int, ...], bool, np.dtype[Any]] = read(file)
+    return found
+
+
 def of_npz(path: Path) -> dict[str, Array]:
     """The samples of an .npz, mapped; {} if they are small, compressed or not as this machine
     computes, and for what is not an .npz: then they are read, and reading says what is wrong."""
@@ -54,11 +63,7 @@ def of_npz(path: Path) -> dict[str, Array]:
             file.seek(member.header_offset)
             name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
             file.seek(name + extra, os.SEEK_CUR)
-            version = FORMAT.read_magic(file)
-            read = (
-                FORMAT.read_array_header_1_0 if version == (1, 0) else FORMAT.read_array_header_2_0
-            )
-            shape, by_columns, dtype = read(file)
+            shape, by_columns, dtype = header(file)
             return {} if by_columns else _samples(path, dtype, file.tell(), shape)
     except (OSError, KeyError, ValueError, struct.error, zipfile.BadZipFile):
         return {}

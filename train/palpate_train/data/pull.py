@@ -130,12 +130,9 @@ class RecordingHost:
 
 @dataclass
 class PullReport:
-    """The names of all recordings, without suffix, by what happened to them.
-
-    fetched: new here. present: already here, and the same. incomplete: .npy or .json is missing on
-    the box. relabelled: the .json on the box differs. different: the .npy on the box differs.
-    refused: not stored; the reason follows the name.
-    """
+    """The names of all recordings, without suffix, by what happened to them. present: already here,
+    and the same. relabelled, different: here with another .json, another .npy. refused: not stored;
+    the reason follows the name."""
 
     fetched: list[str] = field(default_factory=list)
     present: list[str] = field(default_factory=list)

@@ -5,16 +5,12 @@ Nothing is unpickled. An ambiguous file is refused, and the message gives the op
 
 from __future__ import annotations
 
-import csv
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import h5py
 
 from palpate.core.errors import FormatError
-from palpate.core.sweep_file import UNREADABLE
 from palpate_train.data.files import (
     bags,
     hdf5,
@@ -46,11 +42,6 @@ BINARY: Mapping[tuple[str, ...], Reader] = {
 }
 """Readers by the suffixes of their files. Other files are HDF5 or text."""
 POINTER = b"version https://git-lfs"
-LIBRARIES = (sheets.read, parquet.read, tdms.read, bags.read, zarr_store.read)
-DAMAGED = (
-    *UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
-)  # fmt: skip
-"""Exceptions that NumPy, h5py and Python's own libraries raise for damaged files."""
 AGAIN = "if it was cut off, copy or record it again"
 REMEDIES = {
     (
@@ -108,12 +99,15 @@ def read(path: Path, wanted: ReadPlan | None = None) -> Table:
     """The recording in a file. Raises FormatError whose message does not repeat the file's name."""
     try:
         return _read(path, wanted or ReadPlan())
-    except DAMAGED as e:
-        if "plugin" in str(e) or "filter" in str(e):
+    except FormatError:
+        raise
+    except Exception as e:  # libraries raise errors of any type for damaged files
+        why = " ".join(str(e).split()) or repr(e)
+        if "plugin" in why or "filter" in why:
             raise FormatError(
-                f"is packed with a filter that is not here ({e}); repack it: h5repack -f GZIP=1"
+                f"is packed with a filter that is not here ({why}); repack it: h5repack -f GZIP=1"
             ) from e
-        raise FormatError(f"cannot be read: {' '.join(str(e).split())}; {AGAIN}") from e
+        raise FormatError(f"cannot be read: {why}; {AGAIN}") from e
 
 
 def arrays_of(path: Path) -> tuple[str, ...]:
@@ -134,14 +128,6 @@ def _read(path: Path, wanted: ReadPlan) -> Table:
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
     if zarr_store.is_store(path):
         reader = zarr_store.read
-    if reader in LIBRARIES:
-        try:
-            return reader(path, wanted)
-        except FormatError:
-            raise
-        except Exception as e:  # libraries raise errors of any type for damaged files
-            why = " ".join(str(e).split()) or repr(e)
-            raise FormatError(f"cannot be read: {why}; {AGAIN}") from e
     if reader:
         return reader(path, wanted)
     if h5py.is_hdf5(path):

@@ -11,6 +11,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -59,7 +60,7 @@ def read(path: Path, kind: type[Set]) -> Set:
             "name an .npz, an HDF5 file or a folder of recordings"
         )
     if path.is_dir():
-        return read_folder(path, kind)
+        return from_recorded(read_recorded(path), path, kind)
     try:
         path.open("rb").close()
     except OSError as e:
@@ -263,25 +264,33 @@ def _advice(folder: Path) -> str:
     return "record some, or name another folder"
 
 
+def named(recorded: Sequence[RecordedSweep], missing: str, *more: str) -> list[RecordedSweep]:
+    """The sweeps, with the name `missing` where one lacks a name of NAMED_GROUPS that another has,
+    or one of `more`."""
+    kept = usable(recorded)
+    names = [*more, *(by for by in NAMED_GROUPS if any(getattr(one.sweep, by) for one in kept))]
+
+    def completed(one: RecordedSweep) -> RecordedSweep:
+        lacks: dict[str, Any] = {by: missing for by in names if not getattr(one.sweep, by)}
+        return replace(one, sweep=replace(one.sweep, **lacks))
+
+    return [completed(one) for one in recorded]
+
+
 def usable(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
     """The sweeps that we train on."""
     return [one for one in recorded if not one.exclusion]
 
 
-def read_folder(folder: Path, kind: type[Set]) -> Set:
-    """The set of all sweeps that the box recorded in and below `folder`; each sweep is a recording.
+def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
+    """The set of the sweeps that the box recorded in and below `folder`; each is a recording.
 
     Labels are materials. Groups are position and session, numbers if all their names are numbers
     (see group_values.typed). A third group is the object, if NEW OBJECT was ever signalled. Groups
     speed (um/s) and force (mN) exist if every sweep has the value; `source` says if only some have
     it. Sweeps that we do not train on are counted in `source`. Raises FormatError with the name of
-    a file that is broken, lacks a name or has another format.
+    a file that lacks a name or has another format.
     """
-    return from_recorded(read_recorded(folder), folder, kind)
-
-
-def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Set]) -> Set:
-    """The same as `read_folder`, for sweeps that were read already."""
     kept = usable(recorded)
     left = Counter(one.exclusion for one in recorded if one.exclusion)
     source = f"{folder} (left out: {counted(left)})" if left else str(folder)

@@ -7,9 +7,7 @@ reason why the folder cannot be trained on yet.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +15,6 @@ from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.core.text import printable
 from palpate.sim import skin
-from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import labels, readers, sets
 from palpate_train.data.group_values import text_of
 from palpate_train.data.sets import Dataset, shortened
@@ -39,7 +36,7 @@ def describe(spec: str, check: Check = lambda _: ()) -> str:
         said += [*(f"  {line}" for line in check(whole)), *_unsendable(whole.materials)]
         return "\n".join(map(printable, said))
     recorded = readers.read_recorded(folder)
-    whole = readers.from_recorded(_named(recorded), folder, Dataset)
+    whole = readers.from_recorded(readers.named(recorded, UNNAMED, "material"), folder, Dataset)
     lines = [*description(whole), *(f"  {line}" for line in partly_unknown_tare(whole))]
     kept = [one.sweep for one in readers.usable(recorded)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
@@ -99,20 +96,6 @@ def _unsendable(materials: Iterable[str]) -> list[str]:
         if (why := labels.unsendable(materials))
         else []
     )
-
-
-def _named(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
-    """The recordings, with UNNAMED for each missing name."""
-    kept = [one.sweep for one in readers.usable(recorded)]
-    groups = [by for by in readers.NAMED_GROUPS if any(getattr(sweep, by) for sweep in kept)]
-
-    def name(one: RecordedSweep) -> RecordedSweep:
-        missing: dict[str, Any] = {
-            by: UNNAMED for by in ("material", *groups) if not getattr(one.sweep, by)
-        }
-        return replace(one, sweep=replace(one.sweep, **missing))
-
-    return [name(one) for one in recorded]
 
 
 def description(sweeps: Dataset) -> list[str]:

@@ -25,8 +25,7 @@ from palpate.sweeps.sweep_folder import (
     slides_alone,
     taught,
 )
-from palpate_train.data import labels
-from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from_recorded
+from palpate_train.data import labels, readers
 from palpate_train.data.sets import Dataset
 
 NOWHERE = "not named"
@@ -51,12 +50,12 @@ class Lesson:
     def read(cls, folder: Path) -> Lesson:
         """The sweeps in `folder`. Raises FormatError if there is none, or if a label cannot be
         sent."""
-        check_folder(folder)
+        readers.check_folder(folder)
         left_out: Counter[str] = Counter()
         every = list(taught(folder, left_out))
         kept = [one for one in every if one.sweep.material != NOT_THIS]
         if not kept:
-            why = f" ({counted(left_out)})" if left_out else ""
+            why = f" ({readers.counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
         kept = _of_one_format(kept, left_out)
         check = SlidesAmong(kept[0].format)
@@ -65,7 +64,7 @@ class Lesson:
         )
         kept, no_slides = slides_alone(kept, slides)
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
-        sweeps = from_recorded(_named(kept), folder, Dataset)
+        sweeps = readers.from_recorded(readers.named(kept, NOWHERE), folder, Dataset)
         names = tuple(one.path.stem for one in kept)
         others = [
             one.sweep.frames.taxels
@@ -108,21 +107,3 @@ def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> lis
     if len(same) < len(kept):
         left_out["another format"] = len(kept) - len(same)
     return same
-
-
-def _named(kept: Sequence[RecordedSweep]) -> list[RecordedSweep]:
-    """The sweeps, each with a name of every group that any of them has."""
-    position, session = (
-        NOWHERE if any(getattr(one.sweep, name) for one in kept) else "" for name in NAMED_GROUPS
-    )
-    return [
-        replace(
-            one,
-            sweep=replace(
-                one.sweep,
-                position=one.sweep.position or position,
-                session=one.sweep.session or session,
-            ),
-        )
-        for one in kept
-    ]

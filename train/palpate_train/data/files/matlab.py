@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 
 from palpate.core.errors import FormatError
+from palpate_train.data import mapped
 from palpate_train.data.files import hdf5, numpy_files, octave
 from palpate_train.data.files.table import Array, ReadPlan, Table, chosen
 
@@ -77,7 +78,7 @@ def _child(path: Path, target: Path, sender: Connection) -> None:
         with zipfile.ZipFile(target, "w") as archive:
             for name, values in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                    numpy_files.FORMAT.write_array(file, np.asarray(values), allow_pickle=False)
+                    mapped.FORMAT.write_array(file, np.asarray(values), allow_pickle=False)
         sender.send("")
     except FormatError as e:
         sender.send(str(e))

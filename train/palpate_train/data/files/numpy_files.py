@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 
 from palpate.core.errors import FormatError
+from palpate_train.data import mapped
 from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, records
-
-FORMAT: Any = np.lib.format
-"""NumPy's reader of headers; it has no types."""
 
 
 def read_npy(path: Path, wanted: ReadPlan) -> Table:
@@ -35,28 +33,18 @@ def read_npz(path: Path, wanted: ReadPlan) -> Table:
     with zipfile.ZipFile(path) as archive:
         entries: dict[str, Entry] = {}
         for member in archive.namelist():
-            with archive.open(member) as file:
-                if (found := _header(file)) is not None:
-                    name = member.removesuffix(".npy")
-                    entries[name] = Entry.of(*found, partial(_member, archive, member))
+            with archive.open(member) as file, suppress(ValueError):
+                shape, _, dtype = mapped.header(file)
+                if not dtype.hasobject:
+                    read = partial(_member, archive, member)
+                    entries[member.removesuffix(".npy")] = Entry.of(shape, dtype, read)
         return chosen(entries, wanted)
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
-    """Shape and type of an array, None for a member that is not an array of numbers or text."""
-    try:
-        version = FORMAT.read_magic(file)
-        reader = FORMAT.read_array_header_1_0 if version == (1, 0) else FORMAT.read_array_header_2_0
-        shape, _, dtype = reader(file)
-    except ValueError:
-        return None
-    return None if dtype.hasobject else (shape, dtype)
 
 
 def _member(archive: zipfile.ZipFile, member: str) -> Array:
     try:
         with archive.open(member) as file:
-            values: Array = FORMAT.read_array(file, allow_pickle=False)
+            values: Array = mapped.FORMAT.read_array(file, allow_pickle=False)
             return values
     except zipfile.BadZipFile as e:
         raise FormatError(f"{member} is damaged: {e}") from e

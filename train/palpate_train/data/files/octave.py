@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -64,11 +63,7 @@ def _entries(lines: Sequence[str]) -> Iterator[tuple[str, Entry]]:
         kind = TYPE.fullmatch(head.get("type", "").strip())
         if kind and kind[0] and "global" not in head:
             values = _values(name, kind, head, " ".join(lines[end:stop]).split())
-            yield name, Entry.of(values.shape, values.dtype, partial(_given, values))
-
-
-def _given(values: Array) -> Array:
-    return values
+            yield name, Entry.of(values.shape, values.dtype, values.copy)
 
 
 def _values(name: str, kind: re.Match[str], head: dict[str, str], texts: list[str]) -> Array:

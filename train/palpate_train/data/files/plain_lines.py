@@ -48,18 +48,9 @@ BLANK_THOUSANDS = re.compile(r"(?<=\d)[\u00a0\u202f\u2009](?=\d{3}(?!\d))")
 """In a text whose columns other signs separate."""
 
 
-@dataclass(frozen=True)
-class PlainText:
-    """Lines with their numbers alone. names: of the columns, if labels give them. notes: remarks.
-    The lines keep their order and number."""
-
-    lines: Sequence[str]
-    names: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def plain(lines: Sequence[str]) -> PlainText:
-    """The lines of a text without decorations."""
+def plain(lines: Sequence[str]) -> tuple[list[str], tuple[str, ...], list[str]]:
+    """The lines of a text without decorations, in their order and number; the names of the columns,
+    if labels give them; and remarks."""
     lines = [COLOUR.sub("", line).translate(_MINUS) for line in lines]
     some = [*lines[:SAMPLED], *lines[max(SAMPLED, len(lines) - SAMPLED) :]]
     some = [line for line in some if re.search(r"\d", line)]
@@ -80,7 +71,7 @@ def plain(lines: Sequence[str]) -> PlainText:
     if some and sum(bool(CLOCK.match(line)) for line in some) >= USUAL * len(some):
         lines = [CLOCK.sub(_clocked, line) for line in lines]
         names = ("clock", *names) if names else ()
-    return PlainText(lines, names, tuple(notes))
+    return lines, names, notes
 
 
 def _labelled(line: str) -> bool:

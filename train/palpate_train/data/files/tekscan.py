@@ -7,6 +7,7 @@ end. B stands where the sensor has no sensel.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from itertools import pairwise
@@ -95,19 +96,18 @@ def _frame(number: int, rows: Sequence[Row], shape: tuple[int, int]) -> Array:
     """One frame, NaN where there is no sensel."""
     if len(rows) != shape[0]:
         raise FormatError(f"frame {number} has {len(rows)} lines, and ROWS says {shape[0]}")
-    values = np.full(shape, np.nan)
+    values = np.empty(shape)
     for r, (i, line) in enumerate(rows):
         found = _cells(line)
         if len(found) != shape[1]:
             raise FormatError(f"line {i} has {len(found)} columns, and COLS says {shape[1]}")
         for c, cell in enumerate(found):
-            if cell != NO_SENSEL:
-                try:
-                    values[r, c] = float(cell)
-                except ValueError:
-                    raise FormatError(
-                        f"line {i}, column {c + 1} is {excerpt(cell)}, which is not a number"
-                    ) from None
+            try:
+                values[r, c] = math.nan if cell == NO_SENSEL else float(cell)
+            except ValueError:
+                raise FormatError(
+                    f"line {i}, column {c + 1} is {excerpt(cell)}, which is not a number"
+                ) from None
     return values
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from palpate.core.errors import FormatError
 from palpate_train.data.files import plain_lines
 from palpate_train.data.files.decimals import decimal_sign, is_number, plain
-from palpate_train.data.files.plain_lines import PlainText
 from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
 COMMENTS = ("#", "%", "//")
@@ -125,13 +124,15 @@ def table(
 ) -> Table:
     """The table in the lines of a text. delimiter, decimal: "" if the text must show them."""
     decimal = wanted.decimal or decimal
-    bare = PlainText(lines) if lines and lines[0].startswith(LVM) else plain_lines.plain(lines)
-    lines = bare.lines
+    labels: tuple[str, ...] = ()
+    decorations: Sequence[str] = ()
+    if not (lines and lines[0].startswith(LVM)):
+        lines, labels, decorations = plain_lines.plain(lines)
     numbered, names, decimal = _labview(lines, decimal)
     kept = [(i, line) for i, line in numbered if line.strip()]
     layout = _layout(kept, delimiter)
     start, end = _body(kept, layout)
-    said = [*notes, *bare.notes, *_passed_over(kept[:start], layout)]
+    said = [*notes, *decorations, *_passed_over(kept[:start], layout)]
     said += _remarks(kept, start, end, layout)
     rows = [  # a frame that begins with # is no comment
         (i, line)
@@ -141,9 +142,9 @@ def table(
     if between := end - start - len(rows):
         said.append(f"{between} comments between its frames are passed over")
     decimal = decimal or decimal_sign(rows, layout.delimiter, layout.cells)
-    named = len(bare.names) == layout.wide
+    named = len(labels) == layout.wide
     asked = (wanted.time, *wanted.fields)
-    names = names or (bare.names if named else _heads(kept[:start], layout, asked))
+    names = names or (labels if named else _heads(kept[:start], layout, asked))
     names, label = _row_names(names, rows, layout)
     layout = Layout(layout.delimiter, layout.wide, layout.text_columns | label)
     whole = _plain_numbers(rows, layout, decimal)
