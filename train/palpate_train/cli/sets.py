@@ -142,22 +142,18 @@ def run_pull(args: argparse.Namespace) -> None:
 
 def _print(report: pull.PullReport, out: Path) -> None:
     """Print a line for each kind of recording that needs attention."""
+    relabelled = (
+        f"the box has another description; the files in {out} stay: remove .npy and .json there to "
+        "fetch the box's"
+    )
+    different = (
+        f"the box has another sweep of the same name; the sweep in {out} stays: remove it, or pull "
+        "into another folder"
+    )
     for names, what in (
         (report.incomplete, "without its .json or .npy on the box; left there"),
-        (
-            report.relabelled,
-            (
-                f"the box has another description; the files in {out} stay: "
-                "remove .npy and .json there to fetch the box's"
-            ),
-        ),
-        (
-            report.different,
-            (
-                f"the box has another sweep of the same name; the sweep in {out} stays: "
-                "remove it, or pull into another folder"
-            ),
-        ),
+        (report.relabelled, relabelled),
+        (report.different, different),
         (report.refused, "refused"),
     ):
         if names:

@@ -7,6 +7,7 @@ which always takes the middle of each sweep.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -62,19 +63,15 @@ class Change:
         return replace(sweeps, samples=x, rate_hz=sweeps.rate_hz / self.rate, unloaded=unloaded)
 
     def __str__(self) -> str:
-        left = [
-            f"{k} {len(v) if k == 'taxels' else v}"
-            for k, v in vars(self).items()
-            if v != getattr(WHOLE, k)
-        ]
+        left = (f"{k} {len(v) if k == 'taxels' else v}" for k, v in self._changed().items())
         return ", ".join(left) or "all"
 
     def and_then(self, other: Change) -> Change:
         """Both changes, which must leave out different things."""
-        changed = {
-            k: v for one in (self, other) for k, v in vars(one).items() if v != getattr(WHOLE, k)
-        }
-        return Change(**changed)
+        return Change(**self._changed() | other._changed())
+
+    def _changed(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if v != getattr(WHOLE, k)}
 
 
 WHOLE = Change()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -76,26 +76,22 @@ class Provenance:
 def of(figures: Any) -> Provenance:
     """The origin that `figures` state anywhere in them. Methods other than the default have no
     bundle."""
-    found: dict[str, list[Any]] = {field.name: [] for field in fields(Provenance)}
-    for part in _parts(figures):
-        found["commit"] += _texts(part.get("commit"))
-        found["seeds"] += [
-            seed for key in ("seed", "seeds") for seed in _list(part.get(key)) if type(seed) is int
-        ]
-        found["sets"] += [
-            name for key in SETS for name in _texts(part.get(key)) if TEMPLATE not in name
-        ]
-        found["date"] += [
-            text[:10] for key in ("date", "started") for text in _texts(part.get(key))
-        ]
-        found["bundle"] += _bundle(part.get("bundle")) or (
-            _texts(part.get("shipped")) if _has_default(part) else []
-        )
-    commits, bundles, sets = (
-        tuple(dict.fromkeys(found[name])) for name in ("commit", "bundle", "sets")
-    )
+    parts = list(_parts(figures))
+
+    def said(*keys: str) -> list[Any]:
+        """The values of these keys, part by part."""
+        return [value for part in parts for key in keys for value in _list(part.get(key))]
+
+    bundles = [
+        _bundle(part.get("bundle")) or (_texts(part.get("shipped")) if _has_default(part) else [])
+        for part in parts
+    ]
     return Provenance(
-        commits, bundles, sets, tuple(sorted(set(found["seeds"]))), max(found["date"], default="")
+        tuple(dict.fromkeys(_texts(said("commit")))),
+        tuple(dict.fromkeys(name for names in bundles for name in names)),
+        tuple(dict.fromkeys(name for name in _texts(said(*SETS)) if TEMPLATE not in name)),
+        tuple(sorted({seed for seed in said("seed", "seeds") if type(seed) is int})),
+        max((text[:10] for text in _texts(said("date", "started"))), default=""),
     )
 
 

@@ -11,13 +11,6 @@ from typing import Any
 from palpate_train.reports import formatting, html, provenance, selection_plots
 
 Json = Mapping[str, Any]
-NAMES = {
-    "window": "window",
-    "rate": "rate",
-    "taxels": "taxels",
-    "bits": "bits",
-    "classes": "materials",
-}
 
 
 def text(choice: Json) -> str:
@@ -90,7 +83,7 @@ def _curves(choice: Json) -> Iterator[dict[str, Any]]:
         kept = next(point for point in tried if point["name"] == curve["kept"])
         yield {
             "kind": curve["kind"],
-            "name": NAMES[curve["kind"]],
+            "name": "materials" if curve["kind"] == "classes" else curve["kind"],
             "kept": curve["kept"],
             "whole": kept is tried[0],
             "fails": next((point for point in tried if not point.get("fine", True)), None),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     if kind == ".mcap" and mcap_json.may_hold(path):
         return mcap_json.read(path, wanted)
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
-    with _opened(highlevel, source, store, MENDED.get(kind, "")) as bag:
+    with closing(_opened(highlevel, source, store, MENDED.get(kind, ""))) as bag:
         topics: dict[str, list[Any]] = {}
         for connection in bag.connections:
             topics.setdefault(normal(connection.topic), []).append(connection)
@@ -75,22 +75,20 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         return _table(bag, topics[name], labels)
 
 
-@contextmanager
-def _opened(highlevel: Any, source: Path, store: Any, mends: str) -> Iterator[Any]:
+def _opened(highlevel: Any, source: Path, store: Any, mends: str) -> Any:
     """The open recording. Raises FormatError if it was cut off."""
-    with ExitStack() as stack:
-        try:
-            reader = highlevel.AnyReader([source], default_typestore=store)
-            bag = stack.enter_context(reader)
-        except KeyError as e:
-            raise FormatError(
-                f"holds messages in {e}, though it says that it is of ROS 2; record JSON or ROS 2"
-            ) from e
-        except Exception as e:  # its readers raise errors of several types for damaged files
-            if not mends:
-                raise
-            raise FormatError(f"may be cut off ({e}); {mends} makes it whole") from e
-        yield bag
+    try:
+        bag = highlevel.AnyReader([source], default_typestore=store)
+        bag.open()
+    except KeyError as e:
+        raise FormatError(
+            f"holds messages in {e}, though it says that it is of ROS 2; record JSON or ROS 2"
+        ) from e
+    except Exception as e:  # its readers raise errors of several types for damaged files
+        if not mends:
+            raise
+        raise FormatError(f"may be cut off ({e}); {mends} makes it whole") from e
+    return bag
 
 
 def _has_end(path: Path) -> bool:
