@@ -149,7 +149,9 @@ class Store:
         wanted now. Other files in `incoming` are ignored. Another user may own the folder and
         change it meanwhile, so the files are read once and the checked bytes are written.
         """
-        return self._install(self.examine(incoming), shadow, admit)
+        signed = self.examine(incoming)
+        admit(signed.bundle)
+        return self._install(signed, shadow=shadow)
 
     def learn(self, files: Mapping[str, bytes], before: str | None = None) -> str:
         """Install, as `install`, the files of a bundle that this box has taught, or into which it
@@ -159,13 +161,8 @@ class Store:
         return self._install(signed, before=before)
 
     def _install(
-        self,
-        signed: SignedBundle,
-        shadow: bool = False,
-        admit: Callable[[Bundle], object] = lambda bundle: None,
-        before: str | None = None,
+        self, signed: SignedBundle, *, shadow: bool = False, before: str | None = None
     ) -> str:
-        admit(signed.bundle)
         self._warn_of_removed_state()
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
         with self._locked() as state:
