@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core.health import Health
+from palpate.core.observer import Health
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.service.feed import PERIOD_NS, FeedServer
 from palpate.sim import rig, skin

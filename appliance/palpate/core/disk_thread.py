@@ -12,9 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import TypeVar
 
-from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 
 Result = TypeVar("Result")
 MOST_WAITING = 16

@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.core.log import log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.status import Status
 from palpate.deployment import releases
 from palpate.deployment.state import Goal
 from palpate.deployment.trial import ERRORS, Trial
 
 if TYPE_CHECKING:
-    from palpate.core.health import Health
     from palpate.core.types import Verdict
     from palpate.deployment.releases import ReleaseReport
     from palpate.deployment.state import TrialProgress

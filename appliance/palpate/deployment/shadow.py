@@ -21,9 +21,8 @@ from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.disk_thread import AtOnce, DiskWork
 from palpate.core.errors import ApplianceError, BundleError, FormatError
-from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.schema import typed
 from palpate.core.statistics import wilson
 from palpate.core.types import Status, Sweep, Verdict

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Protocol
 from palpate.core.disk_thread import AtOnce, DiskWork
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.log import TroubleLog, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.status import Status
 from palpate.deployment.state import TrialProgress
 
 if TYPE_CHECKING:
-    from palpate.core.health import Health
     from palpate.core.types import Verdict
     from palpate.deployment.state import Goal, Standing
 

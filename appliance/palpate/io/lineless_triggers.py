@@ -19,8 +19,7 @@ from functools import partial
 from palpate.core.clock import Clock
 from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, ConfigError, PortError
-from palpate.core.health import Health
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.types import Edge, EdgeKind, Verdict
 from palpate.io.trigger import EdgeCounters
 

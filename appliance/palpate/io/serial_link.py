@@ -21,7 +21,7 @@ from palpate.core.clock import Clock, wait_readable
 from palpate.core.config import SkinConfig
 from palpate.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost
 from palpate.io import packets, serial_port
-from palpate.io.link import REPLY_MS, TTY_BYTES, reply_to
+from palpate.io.sensor import REPLY_MS, TTY_BYTES, reply_to
 from palpate.io.serial_port import PortInfo
 
 BAUD = 115200

@@ -16,8 +16,7 @@ from palpate.core.config import SkinConfig
 from palpate.core.errors import SensorError, SensorMismatch
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, serial_port, skin_stream
-from palpate.io.link import BytePort, Readable
-from palpate.io.sensor import TransferObserver
+from palpate.io.sensor import BytePort, Readable, TransferObserver
 from palpate.io.serial_link import COLLECT_NS, SerialLink, find
 from palpate.io.serial_port import PortInfo
 from palpate.io.skin_profile import SkinProfile

@@ -20,8 +20,7 @@ from palpate.core.clock import DeviceClock
 from palpate.core.errors import SensorMismatch
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from palpate.io import packets, skin_codecs
-from palpate.io.link import TTY_BYTES
-from palpate.io.sensor import FrameStream, SensorCounters
+from palpate.io.sensor import TTY_BYTES, FrameStream, SensorCounters
 from palpate.io.skin_codecs import Codec, Decoded, Rest
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.usb_sensor import Stream

@@ -13,8 +13,7 @@ from palpate.core.errors import ConfigError, FormatError, SensorAbsent, SensorMi
 from palpate.core.settings_files import SITE
 from palpate.core.types import SweepFormat
 from palpate.io import skin_profile
-from palpate.io.link import SkinLink
-from palpate.io.sensor import TransferObserver
+from palpate.io.sensor import SkinLink, TransferObserver
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.usb_sensor import LinkSensor, UsbSensor, ask, open_link
 

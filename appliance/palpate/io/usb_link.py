@@ -26,7 +26,7 @@ from palpate.core.errors import (
 )
 from palpate.core.text import printable
 from palpate.io import packets
-from palpate.io.link import REPLY_MS, reply_to
+from palpate.io.sensor import REPLY_MS, reply_to
 
 CDC_CONTROL = 2
 DTR, RTS = 1, 2

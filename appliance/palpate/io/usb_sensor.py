@@ -27,8 +27,14 @@ from palpate.core.errors import (
 )
 from palpate.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat, shown
 from palpate.io import packets
-from palpate.io.link import Readable, SkinLink
-from palpate.io.sensor import OPENED, FrameStream, SensorCounters, TransferObserver
+from palpate.io.sensor import (
+    OPENED,
+    FrameStream,
+    Readable,
+    SensorCounters,
+    SkinLink,
+    TransferObserver,
+)
 
 RATE_TOLERANCE = 0.01
 """Largest relative difference of the board's rate from the bundle's, for crystals and timers."""

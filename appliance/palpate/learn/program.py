@@ -17,11 +17,10 @@ from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ApplianceError
-from palpate.core.health import Health
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.core.names import TypedNames
-from palpate.core.observer import Facts, Observer
+from palpate.core.observer import Facts, Health, Observer
 from palpate.core.sentences import CommandHandler, Reply
 from palpate.core.types import Sweep, SweepFormat
 from palpate.inference.classifier import class_distances

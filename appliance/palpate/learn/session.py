@@ -16,9 +16,8 @@ from typing import Any
 from palpate.core.clock import SystemClock
 from palpate.core.config import TeachConfig
 from palpate.core.errors import ApplianceError, ConfigError
-from palpate.core.health import Health
 from palpate.core.log import log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Sweep, Verdict
 from palpate.io.gpio_lines import check_bits

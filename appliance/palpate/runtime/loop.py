@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError, ModelError
-from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
 from palpate.inference.classifier import Classifier, EarlyExit

@@ -21,9 +21,8 @@ from typing import Any
 from palpate import __version__
 from palpate.core.clock import Clock
 from palpate.core.errors import FormatError
-from palpate.core.health import Health
 from palpate.core.log import TroubleLog
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.runtime_folder import FEED_SCHEMA
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.service.feed_reader import MOST_HZ, QUEUE_BYTES, Reader, encode, sweep_line

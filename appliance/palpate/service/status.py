@@ -69,7 +69,7 @@ def _report(data: bytes) -> dict[str, Any]:
     """The content of the file. Raises one of several errors if it is not as StatusFile writes."""
     import json
 
-    from palpate.core.health import Health
+    from palpate.core.observer import Health
     from palpate.core.status import Status
 
     report: dict[str, Any] = json.loads(data)
@@ -117,7 +117,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
     if not report["running"]:
         return [f"not running: {report['why']}"]
     head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
-    from palpate.core.health import Health
+    from palpate.core.observer import Health
 
     rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
     facts = {

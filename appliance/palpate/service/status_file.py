@@ -16,9 +16,8 @@ from typing import Any
 from palpate import __version__
 from palpate.core import storage
 from palpate.core.clock import Clock
-from palpate.core.health import Health
 from palpate.core.log import TroubleLog
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.types import Verdict
 from palpate.service.status import SCHEMA, VERDICTS
 

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from logging import INFO, WARNING
 
 from palpate.core.clock import Clock
-from palpate.core.health import Health
 from palpate.core.log import log
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.status import REASONS, Status
 from palpate.core.types import Verdict
 

@@ -18,9 +18,8 @@ from palpate.core.clock import Clock, DeviceClock
 from palpate.core.errors import FormatError, SensorError, SensorMismatch, SensorOverflow
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets
-from palpate.io.link import SkinLink
 from palpate.io.packets import Packet, Request, SkinFormat
-from palpate.io.sensor import SensorCounters
+from palpate.io.sensor import SensorCounters, SkinLink
 from palpate.io.usb_sensor import RATE_TOLERANCE, Stream
 
 CLOCK_TOLERANCE = 200e-6

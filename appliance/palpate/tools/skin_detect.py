@@ -14,7 +14,7 @@ from palpate.core.config import SkinConfig
 from palpate.core.errors import FormatError, SensorError
 from palpate.core.types import SweepFormat, shown
 from palpate.io import packets, skin_codecs, wire_numbers
-from palpate.io.link import BytePort, reply_to
+from palpate.io.sensor import BytePort, reply_to
 from palpate.io.serial_port import PortInfo
 from palpate.io.serial_sensor import requests, started
 from palpate.io.skin_codecs import Rest

@@ -18,8 +18,7 @@ from palpate.alignment.live import VIEW_NS, ContactTracker, Expected
 from palpate.core.clock import Clock
 from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, FormatError, NoAnswer
-from palpate.core.health import Health
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.sentences import Reply, future_of
 from palpate.core.status import REASONS
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict

@@ -15,7 +15,7 @@ from palpate.core import config
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleError
-from palpate.core.health import Health
+from palpate.core.observer import Health
 from palpate.deployment.store import Store
 from palpate.service.status_file import StatusFile
 from tests.factories import deliveries, feeds, toy_bundle

@@ -20,7 +20,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core import statistics, storage, sweep_file, types
 from palpate.core.config import UNTIL_NEW_OBJECT
 from palpate.core.errors import ApplianceError, BundleError
-from palpate.core.health import Health
+from palpate.core.observer import Health
 from palpate.core.types import Status, Sweep
 from palpate.deployment import shadow
 from palpate.deployment.shadow import Shadow

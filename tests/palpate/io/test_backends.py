@@ -23,8 +23,8 @@ from palpate.core.errors import LineError
 from palpate.core.sentences import checksum, sentence
 from palpate.core.types import EPOCH_BITS, EdgeKind, Frames
 from palpate.io.gpio_lines import Lines
-from palpate.io.link import REPLY_MS
 from palpate.io.robot_link import Command, SerialSink
+from palpate.io.sensor import REPLY_MS
 from palpate.io.trigger import GpioTrigger
 from palpate.io.usb_sensor import UsbSensor
 from tests.rig import backends

@@ -11,7 +11,7 @@ import pytest
 from palpate.cli import teach_command
 from palpate.cli.common import load_settings
 from palpate.cli.parser import arguments
-from palpate.core.health import Health
+from palpate.core.observer import Health
 from palpate.learn import process, program
 from palpate.learn.program import FILE, HandOver
 from palpate.sim.rig import VirtualClock

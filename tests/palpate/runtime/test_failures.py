@@ -13,8 +13,7 @@ from palpate.bundle import bundle
 from palpate.client.answers import Answer
 from palpate.core import config
 from palpate.core.errors import LineError, ModelError
-from palpate.core.health import Health
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference import session
 from palpate.runtime import assembly

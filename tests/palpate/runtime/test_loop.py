@@ -12,8 +12,7 @@ import pytest
 
 from palpate.client.answers import Answer
 from palpate.core import config
-from palpate.core.health import Health
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime import assembly

@@ -15,7 +15,7 @@ import pytest
 
 from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
-from palpate.core.health import Health
+from palpate.core.observer import Health
 from palpate.core.status import REASONS
 from palpate.core.types import Status
 from palpate.service import status

@@ -15,8 +15,7 @@ from typing import Any
 
 import pytest
 
-from palpate.core.health import Health
-from palpate.core.observer import Observer
+from palpate.core.observer import Health, Observer
 from palpate.service.systemd import Notifier
 from palpate.sim import devices, rig
 from tests.factories.simulated_box import SECOND, OnSweep, idle_devices, tubes
