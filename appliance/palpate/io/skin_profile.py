@@ -34,6 +34,8 @@ NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 """Valid names of profiles, and so of their files."""
 _GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
 _USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
+_BYTE = rf"([0-9a-fA-F]{{2}}|{{(period_ms|bytes|{'|'.join(checksums.NAMED)})}})"
+_COMMAND = re.compile(rf"(?s:(?=.{{1,128}}\Z)((?!hex:).*|hex:(\s*{_BYTE})+\s*))")
 _NEEDED = ("about", "source", "codec")
 
 
@@ -48,32 +50,13 @@ def _hexadecimal(most: int) -> Any:
     return custom(b"", f'up to {most} bytes in hexadecimal, such as "aa 55"', read)
 
 
-def _several(allowed: str, fits: Any) -> Any:
-    def read(value: Any) -> tuple[Any, ...] | None:
-        return tuple(value) if isinstance(value, list) and all(map(fits, value)) else None
+def _several(allowed: str, form: re.Pattern[str]) -> Any:
+    def read(value: Any) -> tuple[str, ...] | None:
+        texts = value if isinstance(value, list) else [None]
+        good = all(isinstance(text, str) and form.fullmatch(text) for text in texts)
+        return tuple(map(str, texts)) if good else None
 
     return custom((), allowed, read)
-
-
-def _is_usb_id(value: Any) -> bool:
-    return isinstance(value, str) and bool(_USB_ID.fullmatch(value))
-
-
-def _is_command(value: Any) -> bool:
-    return (
-        isinstance(value, str)
-        and 0 < len(value) <= 128
-        and (not value.startswith("hex:") or _binary(value))
-    )
-
-
-def _binary(value: str) -> bool:
-    for name in ("period_ms", "bytes", *checksums.NAMED):
-        value = value.replace(f"{{{name}}}", "00")
-    try:
-        return bool(bytes.fromhex(value[4:]))
-    except ValueError:
-        return False
 
 
 def _checksum() -> Any:
@@ -103,14 +86,12 @@ class SkinProfile:
     codec: Literal[
         "palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf", "segments", "modbus"
     ] = "palpate"
-    usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
+    usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _USB_ID)
     baud: Annotated[int, Within(1200, 4_000_000)] = 115200
-    start: tuple[str, ...] = _several(
-        'commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command
-    )
-    poll: tuple[str, ...] = _several('commands such as ["r"] or ["hex:01 42"]', _is_command)
-    stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _is_command)
-    tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _is_command)
+    start: tuple[str, ...] = _several('commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _COMMAND)
+    poll: tuple[str, ...] = _several('commands such as ["r"] or ["hex:01 42"]', _COMMAND)
+    stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _COMMAND)
+    tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _COMMAND)
     tare_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     marker: bytes = _hexadecimal(16)
     trailer: bytes = _hexadecimal(16)
