@@ -28,15 +28,13 @@ class AnswerScore:
     """Counts of the answers so far.
 
     labels: labels of the bundle. right, total: by material; the right answer for other materials is
-    `unknown`. objects: whether the last answer for each object was right, if NEW OBJECT was
-    signalled. early: answers that did not need the whole window. slide_frames: frames from START to
+    `unknown`. early: answers that did not need the whole window. slide_frames: frames from START to
     STOP, of all sweeps.
     """
 
     labels: frozenset[str]
     right: Counter[str] = field(default_factory=Counter)
     total: Counter[str] = field(default_factory=Counter)
-    objects: list[bool] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
     early: int = 0
     slide_frames: int = 0
@@ -52,12 +50,6 @@ class AnswerScore:
         self.latency_ms.append(answer.latency_ms)
         self.early += answer.share < 1
         self.slide_frames += act.stop - act.start
-        if not known:
-            return right
-        if act.new_object:
-            self.objects.append(right)
-        elif self.objects:
-            self.objects[-1] = right
         return right
 
     @property
@@ -70,22 +62,21 @@ class AnswerScore:
         return f"{self.right.total()} of {self.answers} answers are right"
 
     def table(self) -> list[str]:
-        """Right answers and totals in lines: by material, of all sweeps, of all objects, of the
-        bundle's materials; then the share of other materials that were called unknown."""
+        """Right answers and totals in lines: by material, and of all sweeps, of the bundle's
+        materials; then the share of other materials that were called unknown."""
+
+        def both(names: list[str]) -> tuple[int, int]:
+            return sum(self.right[name] for name in names), sum(self.total[name] for name in names)
+
         names = sorted(self.total.keys() & self.labels)
-        rows = [(name, self.right[name], self.total[name]) for name in names]
-        sums = []
-        if rows:
-            sums = [("all sweeps", sum(right for _, right, _ in rows), sum(n for *_, n in rows))]
-        if self.objects:
-            sums.append(("all objects", sum(self.objects), len(self.objects)))
-        lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
-        for name, right, n in sums:
+        lines = [f"  {name:<16}{self.right[name]:>5} / {self.total[name]}" for name in names]
+        if names:
+            right, n = both(names)
             low, high = wilson(right, n)
             percent = f"{100 * right / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-            lines.append(f"  {name:<16}{right:>5} / {n:<5} {percent}")
+            lines.append(f"  {'all sweeps':<16}{right:>5} / {n:<5} {percent}")
         if others := sorted(self.total.keys() - self.labels):
-            right, n = (sum(counts[name] for name in others) for counts in (self.right, self.total))
+            right, n = both(others)
             called = f"{right} of {n} sweeps called unknown ({', '.join(others)})"
             lines.append(f"  not in the bundle: {called}")
         return ["  material        right / all", *lines]

@@ -22,13 +22,13 @@ def answer(number: int, label: str, status: Status = Status.OK, share: float = 1
     return read
 
 
-def act(label: str, *, new_object: bool = False) -> Act:
+def act(label: str) -> Act:
     """A slide of 1500 frames over a tube of this material."""
-    return Act(np.zeros((1, 4, 4), np.uint8), 0, 1500, label, new_object)
+    return Act(np.zeros((1, 4, 4), np.uint8), 0, 1500, label)
 
 
 def test_only_ok_with_the_right_label_counts():
-    """Unsure is wrong; an object by its last answer; percentages have intervals."""
+    """Unsure is wrong; percentages have intervals."""
     score = AnswerScore(frozenset({"wood", "paper"}))
     right = [
         score.add(act("wood"), answer(1, "wood")),
@@ -42,25 +42,19 @@ def test_only_ok_with_the_right_label_counts():
     assert "[15.0, 85.0]" in table
     assert re.match(r"2\.00 s .*1 of 4", score.touch(750.0))
     assert score.latency().count("1.50 ms") == 2
-    score = AnswerScore(frozenset({"wood", "paper"}))
-    for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
-        score.add(act("wood", new_object=new), answer(1, label))
-    assert score.objects == [True, False]
-    assert score.table()[-1].split()[:6] == ["all", "objects", "1", "/", "2", "50.0"]
 
 
 def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
-    """Sweeps of such a material are counted apart; its objects do not count as wrong."""
+    """Sweeps of such a material are counted apart."""
     score = AnswerScore(frozenset({"wood"}))
     right = [
-        score.add(act("cork", new_object=True), answer(1, "wood")),
+        score.add(act("cork"), answer(1, "wood")),
         score.add(act("cork"), answer(2, "", Status.UNKNOWN)),
         score.add(act("felt"), answer(3, "", Status.UNSURE)),
         score.add(act("wood"), answer(4, "wood")),
     ]
     assert right == [False, True, False, True]
     assert score.answers == 4
-    assert score.objects == []
     *counted, apart = score.table()[1:]
     assert re.findall(r"\d+ / \d+", "".join(counted)) == ["1 / 1", "1 / 1"]
     assert "1 of 3" in apart
