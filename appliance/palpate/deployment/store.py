@@ -29,7 +29,7 @@ from pathlib import Path
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core import storage
-from palpate.core.clock import Clock, SystemClock
+from palpate.core.clock import SystemClock
 from palpate.core.config import StoreConfig
 from palpate.core.errors import (
     ApplianceError,
@@ -83,7 +83,6 @@ class Store:
         self,
         settings: StoreConfig,
         prove: Callable[[Bundle], object],
-        clock: Clock | None = None,
         boot: Path = BOOT,
         *,
         taught: bool = True,
@@ -92,7 +91,7 @@ class Store:
         key = EnrolmentKey(settings.enrolment_key)
         self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key, taught=taught)
         self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
-        self._clock, self._boot_file = clock or SystemClock(), boot
+        self._clock, self._boot_file = SystemClock(), boot
 
     @property
     def current(self) -> str:

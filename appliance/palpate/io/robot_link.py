@@ -17,8 +17,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TextIO
 
-import serial
-
 from palpate.core import sentences
 from palpate.core.clock import Clock
 from palpate.core.config import SerialConfig
@@ -139,17 +137,12 @@ def _can_be_written(stream: TextIO) -> bool:
 
 
 class SerialSink:
-    """Sentences to and commands from a serial port, which may be unplugged and come back. opener:
-    opens a `serial.Serial`. dropped: number of sentences that the peer did not read."""
+    """Sentences to and commands from a serial port, which may be unplugged and come back.
+    dropped: number of sentences that the peer did not read."""
 
-    def __init__(
-        self,
-        config: SerialConfig,
-        clock: Clock,
-        opener: Callable[..., Any] = serial.Serial,
-    ) -> None:
+    def __init__(self, config: SerialConfig, clock: Clock) -> None:
         self.name, self.dropped, self.trouble = config.port, 0, ""
-        self._config, self._clock, self._opener = config, clock, opener
+        self._config, self._clock = config, clock
         self._port: Any = None
         self._retry_ns = clock.now_ns()
         self._queue: deque[bytes] = deque()
@@ -221,7 +214,7 @@ class SerialSink:
             return False
         self._retry_ns = now + RETRY_NS
         try:
-            port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
+            port = serial_port.open_alone(self._config.port, self._config.baud)
         except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             advice = "check serial.port and group dialout"
             if serial_port.is_held(e):

@@ -15,8 +15,6 @@ import termios
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import serial
-
 from palpate.core.clock import Clock, wait_readable
 from palpate.core.config import SkinConfig
 from palpate.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorError, SensorLost
@@ -45,14 +43,13 @@ class SerialLink:
         path: str,
         baud: int,
         clock: Clock,
-        opener: Callable[..., Any] = serial.Serial,
         wait: Callable[[int, float], bool] = wait_readable,
         collect_ns: int = COLLECT_NS,
     ) -> None:
         self.path, self._clock, self._wait, self._collect_ns = path, clock, wait, collect_ns
         self._next_ns = 0  # time of the next read
         try:
-            self._port = serial_port.open_alone(path, baud, opener)
+            self._port = serial_port.open_alone(path, baud)
         except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             raise _refused(path, e) from e
         _be_prompt(self._port)

@@ -7,7 +7,6 @@ import errno
 import fcntl
 import os
 import termios
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,11 +54,11 @@ def _named(port: Any) -> tuple[str, str]:
     return printable(port.serial_number or ""), printable(port.product or port.description or "")
 
 
-def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:
+def open_alone(path: str, baud: int) -> Any:
     """The open port at `path`, non-blocking, with an empty buffer, and closed to other programs.
-    opener: opens a `serial.Serial`. Raises OSError, or ValueError for an unsupported baud rate;
-    `is_held` tells whether another program has it."""
-    port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
+    Raises OSError, or ValueError for an unsupported baud rate; `is_held` tells whether another
+    program has it."""
+    port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
     try:
         # The kernel refuses any further open, except by root: another reader would take bytes away,
         # and a lock only binds programs that check it. A pseudo-terminal would stay locked, also

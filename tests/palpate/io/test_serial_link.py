@@ -198,14 +198,15 @@ def test_a_port_has_one_program_and_keeps_dtr(line, monkeypatch):
         (errno.EIO, SensorLost, "baud"),
     ],
 )
-def test_a_port_that_cannot_be_opened(code, kind, hint):
+def test_a_port_that_cannot_be_opened(monkeypatch, code, kind, hint):
     """Each errno of opening has its state and names the port."""
 
     def refuse(*args, **options) -> None:
         raise serial.SerialException(code, "refused")
 
+    monkeypatch.setattr(serial, "Serial", refuse)
     with pytest.raises(kind, match=hint) as e:
-        SerialLink("/dev/ttyX9", 115200, CLOCK, refuse)
+        SerialLink("/dev/ttyX9", 115200, CLOCK)
     assert type(e.value) is kind
     assert "/dev/ttyX9" in str(e.value)
 
