@@ -279,17 +279,13 @@ class Verdict:
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
         None. arrays: include `scores` and `own`, as lists."""
-        values = {
-            name: value for name in Verdict.__slots__ if (value := getattr(self, name)) is not None
-        }
+        values = {name: value for name, value in entries(self).items() if value is not None}
         # sidecars, the feed and the status file call the displacement `moved`
         values["moved"] = values.pop("displacement", "")
         values.setdefault("degraded", "")
-        lists = {
-            name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
-        }
-        return (
-            values | lists
-            if arrays
-            else {name: v for name, v in values.items() if name not in lists}
-        )
+        for name in ("scores", "own"):
+            if arrays:
+                values[name] = values[name].tolist()
+            else:
+                del values[name]
+        return values

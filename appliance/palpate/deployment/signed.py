@@ -120,11 +120,7 @@ class BundleFolder:
 
     def put(self, signed: SignedBundle) -> None:
         """Write a bundle, completely or not at all. Raises OSError."""
-        folder = self.at(signed.sha)
-        if folder.exists() and _holds(folder, signed.files):
-            storage.sync(self.folder)  # the program that renamed it may have been killed before
-            return
-        with storage.folder(folder) as new:
+        with storage.folder(self.at(signed.sha)) as new:
             for name, data in signed.files.items():
                 (new / name).write_bytes(data)
 
@@ -137,10 +133,3 @@ class BundleFolder:
             if not folder.name.startswith(INCOMPLETE):
                 folder = folder.rename(folder.with_name(INCOMPLETE + folder.name))
             shutil.rmtree(folder)
-
-
-def _holds(folder: Path, files: Mapping[str, bytes]) -> bool:
-    try:
-        return bundle.files(folder) == files
-    except BundleError:
-        return False

@@ -1,5 +1,5 @@
 """Finds GPIO lines by name, requests them and drives the outputs READY, BUSY, FAULT, DECIDED, class
-bits and RESULT VALID, which hold a verdict as a code.
+bits and RESULT VALID, which hold a verdict as a code (`robot_link.LineSink`).
 
 All access is through libgpiod v2. The module (`import gpiod`, or the simulator's double) is passed
 in. numpy is not imported, since `cli.lower_outputs` needs to start fast.
@@ -13,9 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from palpate.core.errors import ConfigError, LineError
-from palpate.core.observer import Observer
-from palpate.core.status import Status
+from palpate.core.errors import LineError
 from palpate.core.text import closest
 
 if TYPE_CHECKING:
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
     from palpate.core.clock import Clock
     from palpate.core.config import OutputConfig
-    from palpate.core.types import Verdict
 
 MAX_CHIPS = 256
 """Largest number of GPIO devices in the kernel (GPIO_DEV_MAX)."""
@@ -233,23 +230,3 @@ class Lines:
                 with naming("write", changed.values()):
                     request.set_values({o: level[new[n]] for o, n in changed.items()})
                 self._levels.update({name: new[name] for name in changed.values()})
-
-
-class LineSink(Observer):
-    """Outputs the verdict as a code: 1 + the label's index in the manifest, or 0."""
-
-    def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
-        check_bits(lines.capacity, labels)
-        self._lines = lines
-        self._code = {label: i + 1 for i, label in enumerate(labels)}
-
-    def answered(self, verdict: Verdict) -> None:
-        """Output the code and raise RESULT VALID."""
-        self._lines.result(self._code[verdict.label] if verdict.status is Status.OK else 0)
-
-
-def check_bits(codes: int, labels: Sequence[str]) -> None:
-    """Raises ConfigError if `codes` are too few for the labels and the code 0."""
-    if codes <= len(labels):
-        needed = f"{len(labels)} labels and the code 0 do not fit output.class_bits"
-        raise ConfigError(f"{needed}, which have {codes} codes; wire more GPIO lines, or none")

@@ -1,4 +1,5 @@
 """The serial line to the robot controller: sends verdicts and other sentences, and reads commands.
+And the verdict as a code on GPIO lines.
 
 `core.sentences` defines sentences. Nothing here waits for the port: if the peer does not read,
 sentences are dropped and counted, and no frame is lost.
@@ -13,16 +14,19 @@ import select
 import sys
 import termios
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TextIO
 
 from palpate.core import sentences
 from palpate.core.clock import Clock
 from palpate.core.config import SerialConfig
+from palpate.core.errors import ConfigError
+from palpate.core.observer import Observer
 from palpate.core.sentences import TALKER, UNSAFE
-from palpate.core.types import Verdict
+from palpate.core.types import Status, Verdict
 from palpate.io import serial_port
+from palpate.io.gpio_lines import Lines
 
 COMMANDS = (
     *("ID", "STATE", "TEST", "LABEL", "TARE", "NEW", "ABORT", "START", "STOP"),
@@ -234,3 +238,23 @@ class SerialSink:
 
 Port = SerialSink | StdoutPort
 """The line to the robot, for sentences and commands; neither waits."""
+
+
+class LineSink(Observer):
+    """Outputs the verdict as a code: 1 + the label's index in the manifest, or 0."""
+
+    def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
+        check_bits(lines.capacity, labels)
+        self._lines = lines
+        self._code = {label: i + 1 for i, label in enumerate(labels)}
+
+    def answered(self, verdict: Verdict) -> None:
+        """Output the code and raise RESULT VALID."""
+        self._lines.result(self._code[verdict.label] if verdict.status is Status.OK else 0)
+
+
+def check_bits(codes: int, labels: Sequence[str]) -> None:
+    """Raises ConfigError if `codes` are too few for the labels and the code 0."""
+    if codes <= len(labels):
+        needed = f"{len(labels)} labels and the code 0 do not fit output.class_bits"
+        raise ConfigError(f"{needed}, which have {codes} codes; wire more GPIO lines, or none")

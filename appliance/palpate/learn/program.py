@@ -24,8 +24,7 @@ from palpate.core.observer import Facts, Health, Observer
 from palpate.core.sentences import CommandHandler, Reply
 from palpate.core.types import Sweep, SweepFormat
 from palpate.inference.classifier import class_distances
-from palpate.io.gpio_lines import check_bits
-from palpate.io.robot_link import Command
+from palpate.io.robot_link import Command, check_bits
 from palpate.learn import install, materials
 from palpate.learn.enrolment import slide_check
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained

@@ -20,7 +20,7 @@ from palpate.core.log import log
 from palpate.core.observer import Health, Observer
 from palpate.core.sentences import CommandHandler, Reply, future_of, sentence
 from palpate.core.types import Sweep, Verdict
-from palpate.io.gpio_lines import check_bits
+from palpate.io.robot_link import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import NOT_THIS, number_of

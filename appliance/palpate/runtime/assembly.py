@@ -26,7 +26,7 @@ from palpate.deployment.store import Store
 from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.inference.session import try_all
 from palpate.io import skins
-from palpate.io.gpio_lines import Lines, LineSink, check_bits
+from palpate.io.gpio_lines import Lines
 from palpate.io.lineless_triggers import (
     CommandTrigger,
     KeyTrigger,
@@ -34,7 +34,7 @@ from palpate.io.lineless_triggers import (
     TimedTrigger,
     standard_input,
 )
-from palpate.io.robot_link import Port, SerialSink, StdoutPort
+from palpate.io.robot_link import LineSink, Port, SerialSink, StdoutPort, check_bits
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.runtime.loop import Answerer, Box
 from palpate.sweeps.capture import CaptureWriter

@@ -21,8 +21,8 @@ from palpate.core.errors import ConfigError
 from palpate.core.sentences import MAX_LINE, OWN, checksum, sentence
 from palpate.core.types import Status, Verdict
 from palpate.io import serial_port
-from palpate.io.gpio_lines import Lines, LineSink
-from palpate.io.robot_link import Command, SerialSink, StdoutPort, parse, result
+from palpate.io.gpio_lines import Lines
+from palpate.io.robot_link import Command, LineSink, SerialSink, StdoutPort, parse, result
 from palpate.sim import gpio, rig
 from palpate.tools import pseudo_terminal
 from tests.factories.paths import ROOT
