@@ -15,7 +15,6 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,7 +29,6 @@ from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
 Array = NDArray[np.float64]
-UNDISTURBED: Mapping[str, float] = MappingProxyType({})
 KEPT = 16
 """Number of unknown sweeps that are remembered."""
 ALIKE = 0.5
@@ -279,7 +277,7 @@ class ClassDistances:
         return np.asarray(logits, np.float32)
 
     def measured(
-        self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED
+        self, embedding: NDArray[Any], disturbed: Mapping[str, float]
     ) -> tuple[NDArray[np.float32], float]:
         """Squared distances [K] to the labels, and the limit that they are compared with.
 
@@ -334,7 +332,7 @@ class KnownMaterial:
         context.logits = means.joined(context.logits, z)
         far, limit = means.measured(z, context.disturbed)
         if not off:
-            context.far = np.log1p(far / limit)
+            context.far = np.log1p(far / means.limit)
         k = int(far.argmin())
         if far[k] <= limit:
             return None

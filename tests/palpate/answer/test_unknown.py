@@ -15,7 +15,7 @@ from palpate.answer.objects import softmax
 from palpate.answer.unknown import KEPT, EarlyClasses, EarlyDistances
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
-from palpate.core.config import UNTIL_NEW_OBJECT
+from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier, EarlyExit
@@ -155,6 +155,15 @@ def test_means_and_limits_move_with_the_disturbance(tmp_path):
     assert "frames" in beyond.detail
     bare = toy_bundle.load(tmp_path / "bare", known=None, disturbances=ALLOWED)
     assert answer(bare, lost(0, 0, 6)).label == "a"  # without means nothing is allowed
+
+
+def test_a_disturbance_ends_no_object(tmp_path):
+    """Though it widens the limit, and with it what counts as far, to seven times."""
+    arrays = {"changes": np.zeros((1, 3, 2), np.float16)}
+    wide = Disturbances((Allowance("lost", 0.0, 0.25, 30.0),), 4.0)
+    it = Classifier(disturbed(tmp_path, wide, arrays=arrays), VirtualClock(), ClassifierConfig())
+    first, second = toy_bundle.sweep(0, 0, 1, 1), replace(lost(0, 0), id=2, object=1)
+    assert [it(first).fused, it(second).fused] == [1, 2]
 
 
 def test_displaced_sweeps_are_allowed_the_same(tmp_path):

@@ -140,7 +140,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
             np.zeros((4, 0, 0), np.float16),
         )
         means = ClassDistances(classes, known, ("a", "b", "c", "felt"))
-        kept += [means.measured(z)[0].min() <= means.limit for z in rng.normal(size=(40, 2))]
+        kept += [means.measured(z, {})[0].min() <= means.limit for z in rng.normal(size=(40, 2))]
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
 
 
