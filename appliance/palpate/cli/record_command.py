@@ -24,7 +24,7 @@ from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import Reply
 from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
-from palpate.io.robot_link import Command, Port
+from palpate.io.robot_link import Command
 from palpate.runtime import assembly
 from palpate.runtime.reporting import capture, done, feed, status
 from palpate.service.systemd import Notifier
@@ -43,9 +43,8 @@ def run(args: argparse.Namespace) -> int:
         devices, format = open_skin(args, settings)
         port = assembly.port(settings, devices, terminal=False)
         folder, disk = args.out or settings.kept("sweeps"), DiskThread()
-        recording = RecordingSession(
-            folder, format, labels, devices.clock, _sentences(port), args.target, disk
-        )
+        say = port.say if port else lambda line: None
+        recording = RecordingSession(folder, format, labels, devices.clock, say, args.target, disk)
         stack.callback(recording.close)
         obey: Callable[[Command], Reply] = lambda command: box.obey(command)  # noqa: E731
         talk = recording.about, obey, recording.names.label
@@ -165,7 +164,3 @@ def _check_length(format: SweepFormat, settings: Config) -> None:
     if window_s > most_s:
         longer = f"a window of {window_s:g} s is longer than any sweep may last ({most_s:g} s)"
         raise ConfigError(f"{longer}; use a shorter --window, or raise sweep.max_duration_s")
-
-
-def _sentences(port: Port | None) -> Callable[[bytes], None]:
-    return port.say if port else lambda line: None

@@ -138,8 +138,7 @@ def _holders(name: str, trusted: bytes) -> list[str]:
 
 def _is_signer(line: str) -> bool:
     """Whether a line is a name and a key of the kind that the line states."""
-    found = LINE.fullmatch(line)
-    if not found:
+    if not (found := LINE.fullmatch(line)):
         return False
     kind = found["kind"].encode()
     try:

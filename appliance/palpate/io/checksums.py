@@ -64,18 +64,15 @@ def mirrored(value: int, bits: int) -> int:
 @lru_cache(4)
 def _table(poly: int, bits: int, reflected: bool) -> list[int]:
     """The CRC of each byte."""
-    table = []
-    if reflected:
-        poly = mirrored(poly, bits)
+    table, most = [], (1 << bits) - 1
     for byte in range(256):
-        value = byte if reflected else byte << (bits - 8)
+        value = byte << (bits - 8)
         for _ in range(8):
-            if reflected:
-                value = value >> 1 ^ (poly if value & 1 else 0)
-            else:
-                value = (value << 1 ^ (poly if value >> (bits - 1) else 0)) & ((1 << bits) - 1)
+            value = (value << 1 ^ (poly if value >> (bits - 1) else 0)) & most
         table.append(value)
-    return table
+    if not reflected:
+        return table
+    return [mirrored(table[mirrored(byte, 8)], bits) for byte in range(256)]
 
 
 def _crc(kind: str, parameters: str) -> Checksum:

@@ -238,10 +238,7 @@ def pack_identity(who: Identity) -> bytes:
 
 def unpack_identity(payload: bytes) -> Identity:
     """Read an IDENTITY reply, which may be longer. Raises FormatError."""
-    if len(payload) < _IDENTITY.size:
-        wanted = f"protocol {VERSION} has {_IDENTITY.size}"
-        raise FormatError(f"identity of {len(payload)} bytes; {wanted}: check the firmware")
-    protocol, major, minor, patch, board, serial = _IDENTITY.unpack_from(payload)
+    protocol, major, minor, patch, board, serial = _reply(payload, _IDENTITY, "identity")
     return Identity(protocol, (major, minor, patch), _text(board), _text(serial))
 
 
@@ -253,17 +250,19 @@ def pack_format(skin: SkinFormat) -> bytes:
 
 def unpack_format(payload: bytes) -> SkinFormat:
     """Read a FORMAT reply. Raises FormatError."""
-    if len(payload) < _FORMAT.size:
-        wanted = f"protocol {VERSION} has {_FORMAT.size}"
-        raise FormatError(f"format of {len(payload)} bytes; {wanted}: check the firmware")
-    rows, cols, code, axes, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
+    rows, cols, code, axes, rate_mhz, fifo, packet_frames = _reply(payload, _FORMAT, "format")
     if code >= len(DATA_TYPES):
         raise FormatError(f"data type {code} is not among 0..{len(DATA_TYPES) - 1}; update the box")
     if axes > MOST_AXES:
         raise FormatError(f"{axes} axes of a taxel, at most {MOST_AXES}; check the firmware")
-    return SkinFormat(
-        rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1
-    )
+    return SkinFormat(rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo, packet_frames, axes or 1)
+
+
+def _reply(payload: bytes, parts: struct.Struct, what: str) -> tuple[Any, ...]:
+    if len(payload) < parts.size:
+        wanted = f"protocol {VERSION} has {parts.size}"
+        raise FormatError(f"{what} of {len(payload)} bytes; {wanted}: check the firmware")
+    return parts.unpack_from(payload)
 
 
 def _axes_byte(axes: int = 1) -> int:
