@@ -7,23 +7,20 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
 from palpate.cli.common import load_settings
 from palpate.core.clock import SystemClock
+from palpate.core.config import Config, StoreConfig
 from palpate.core.errors import ApplianceError, BundleError
+from palpate.core.types import SweepFormat
 from palpate.deployment.signed import PACKAGER
 from palpate.deployment.state import MOST_STARTS, PACKAGED, StoreState
 from palpate.deployment.store import SHA, Store
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
 from palpate.service import status
-
-if TYPE_CHECKING:
-    from palpate.bundle.bundle import Bundle
-    from palpate.core.config import Config, StoreConfig
-    from palpate.core.types import SweepFormat
 
 NEXT = "from the next start on: systemctl restart palpate"
 

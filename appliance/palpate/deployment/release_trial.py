@@ -20,14 +20,13 @@ from typing import TYPE_CHECKING
 from palpate.core.log import log
 from palpate.core.observer import Health, Observer
 from palpate.core.status import Status
+from palpate.core.types import Verdict
 from palpate.deployment import releases
-from palpate.deployment.state import Goal
+from palpate.deployment.releases import ReleaseReport
+from palpate.deployment.state import Goal, TrialProgress
 from palpate.deployment.trial import ERRORS, Trial
 
 if TYPE_CHECKING:
-    from palpate.core.types import Verdict
-    from palpate.deployment.releases import ReleaseReport
-    from palpate.deployment.state import TrialProgress
     from palpate.sweeps.black_box import BlackBox
 
 GOAL = Goal(50, 24 * 3600.0, both=True)

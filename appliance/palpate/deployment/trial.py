@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from palpate.core.disk_thread import AtOnce, DiskWork
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Health, Observer
 from palpate.core.status import Status
-from palpate.deployment.state import TrialProgress
-
-if TYPE_CHECKING:
-    from palpate.core.types import Verdict
-    from palpate.deployment.state import Goal, Standing
+from palpate.core.types import Verdict
+from palpate.deployment.state import Goal, Standing, TrialProgress
 
 RETRY_NS = 10_000_000_000
 """Pause after a failed write."""
