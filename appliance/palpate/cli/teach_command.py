@@ -6,7 +6,7 @@ import argparse
 import getpass
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -131,11 +131,8 @@ def _sweeps(settings: Config) -> Iterator[SweepFolder]:
     """The folder of the recorded sweeps. Raises ConfigError if another program uses it."""
     path = settings.kept("sweeps")
     try:
-        folder = SweepFolder(path, None)
-        try:
+        with closing(SweepFolder(path, None)) as folder:
             yield folder
-        finally:
-            folder.close()
     except OSError as e:
         raise ConfigError(f"{path}: {e.strerror}; use the page, or stop that program") from e
 

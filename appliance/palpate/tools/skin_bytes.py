@@ -4,7 +4,6 @@ bytes, and the first byte that does not fit the profile."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,12 +19,8 @@ WIDTH = 16
 """Bytes of a printed line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Misfit:
-    """The first byte that does not fit. at: its offset in the stream. why: what is expected."""
-
-    at: int
-    why: str
+Misfit = tuple[int, str]
+"""The first byte that does not fit: its offset in the stream, and what is expected."""
 
 
 def report(profile: SkinProfile, data: bytes) -> tuple[list[str], bool]:
@@ -42,9 +37,9 @@ def report(profile: SkinProfile, data: bytes) -> tuple[list[str], bool]:
         lines.append(np.array2string(found.taxels[i], threshold=256, max_line_width=96))
     misfit = first_misfit(profile, data, found, spans)
     if misfit:
-        lines.append(f"byte {misfit.at} does not fit: {misfit.why}")
-        begin = max(0, misfit.at - WIDTH)
-        lines += dump(data, begin, min(len(data), misfit.at + WIDTH), misfit.at)
+        at, why = misfit
+        lines.append(f"byte {at} does not fit: {why}")
+        lines += dump(data, max(0, at - WIDTH), min(len(data), at + WIDTH), at)
     lines.append(f"{len(found)} frames in {len(data)} bytes, {found.garbage} bytes in no frame")
     return lines, misfit is None and len(found) > 0 and not found.wrong
 
@@ -65,7 +60,7 @@ def first_misfit(
 ) -> Misfit | None:
     """The first byte that does not fit; None if all fit."""
     if found.wrong:
-        return Misfit(spans[0][0] if spans else 0, found.wrong)
+        return spans[0][0] if spans else 0, found.wrong
     before = 0
     for begin, end in spans:
         # the first gap is the rest of a frame whose beginning was not heard
@@ -86,29 +81,26 @@ def _spans(profile: SkinProfile, found: Decoded) -> list[tuple[int, int]]:
 def _why(profile: SkinProfile, data: bytes, at: int, found: Decoded) -> Misfit:
     """The reason why no frame of the profile begins at or soon after `at`."""
     if profile.codec != "fixed":
-        return Misfit(at, found.misfit or "no frame of the profile begins here")
+        return at, found.misfit or "no frame of the profile begins here"
     layout = fixed.layout(profile)
     mark = layout.mark
     begin = data.find(mark, max(0, at - layout.tail))
     if begin < 0:
-        return Misfit(at, f"{mark.hex(' ')} does not come from here on; correct marker or trailer")
+        return at, f"{mark.hex(' ')} does not come from here on; correct marker or trailer"
     due = begin + layout.period
     wrong = _first_difference(data[due : due + len(mark)], mark)
     if wrong is not None:
         after = data.find(mark, begin + 1)
         step = f"; it comes {after - begin} bytes after the last" if after > 0 else ""
-        return Misfit(
-            due + wrong,
+        return due + wrong, (
             f"{data[due + wrong]:02x} where {mark[wrong]:02x} of {mark.hex(' ')} is expected,"
-            f" {layout.period} bytes after the last{step}",
+            f" {layout.period} bytes after the last{step}"
         )
     sent, right = layout.sums(data[begin:due])
     if due <= len(data) and (wrong := _first_difference(sent, right)) is not None:
-        return Misfit(
-            begin + layout.check + wrong,
-            f"the {profile.checksum} is {sent.hex(' ')}, {right.hex(' ')} is expected",
-        )
-    return Misfit(begin, found.misfit or "the beginning of a frame is ambiguous here")
+        expected = f"the {profile.checksum} is {sent.hex(' ')}, {right.hex(' ')} is expected"
+        return begin + layout.check + wrong, expected
+    return begin, found.misfit or "the beginning of a frame is ambiguous here"
 
 
 def _first_difference(sent: bytes, expected: bytes) -> int | None:
