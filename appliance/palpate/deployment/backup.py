@@ -16,7 +16,6 @@ import pwd
 import re
 import shutil
 import tarfile
-from collections.abc import Iterator
 from grp import getgrnam
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -60,20 +59,14 @@ def save(out: IO[bytes], root: Path = Path("/")) -> int:
             folder = root / place[1:]
             if not folder.is_dir():
                 raise ApplianceError(f"there is no {folder}; Palpate is not installed here")
-            for path in _ordered(part, folder):
-                _add(tar, path, f"{part}/{path.relative_to(folder)}", digests)
+            named = {f"{part}/{path.relative_to(folder)}": path for path in folder.rglob("*")}
+            for name in sorted(named, key=lambda name: (name not in FIRST, name != FIRST[0], name)):
+                _add(tar, named[name], name, digests)
         text = json.dumps({"schema": SCHEMA, "files": digests}).encode()
         member = tarfile.TarInfo(END)
         member.size = len(text)
         tar.addfile(member, io.BytesIO(text))
     return len(digests)
-
-
-def _ordered(part: str, folder: Path) -> Iterator[Path]:
-    paths = sorted(folder.rglob("*"))
-    first = [folder / name.partition("/")[2] for name in FIRST if name.startswith(f"{part}/")]
-    yield from (path for path in first if os.path.lexists(path))
-    yield from (path for path in paths if path not in first)
 
 
 def _add(tar: tarfile.TarFile, path: Path, name: str, digests: dict[str, str]) -> None:
