@@ -135,7 +135,6 @@ class Stage(Protocol):
 
     def apply(self, context: Context) -> Refusal | None:
         """Add to `context` what this stage finds; the refusal if the sweep gets no label."""
-        ...
 
 
 def run(stages: Sequence[Stage], context: Context) -> Context:

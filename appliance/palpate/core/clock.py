@@ -24,11 +24,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """`CLOCK_MONOTONIC` in nanoseconds, the clock by which the kernel stamps GPIO edges."""
-        ...
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, or at once if that has passed."""
-        ...
 
 
 class SystemClock:

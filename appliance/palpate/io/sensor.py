@@ -46,34 +46,28 @@ class Sensor(Protocol):
     @property
     def state(self) -> str:
         """`streaming`, or the state that prevents it (PROTOCOL.md, states of the skin)."""
-        ...
 
     @property
     def trouble(self) -> SensorError | None:
         """The reason why it is not streaming, with a remedy; None while it streams."""
-        ...
 
     @property
     def identity(self) -> packets.Identity | None:
         """Name and version of the readout board; None before it was asked."""
-        ...
 
     @property
     def clock(self) -> dict[str, float] | None:
         """Accuracy of the times: DeviceClock.quality."""
-        ...
 
     @property
     def loss_known(self) -> bool:
         """Whether every lost frame is seen, not only losses that times show."""
-        ...
 
     @property
     def counters(self) -> SensorCounters: ...
 
     def read(self) -> Frames:
         """The frames since the last call; an empty Frames after a bounded wait."""
-        ...
 
 
 OPENED = "opened"
@@ -86,11 +80,9 @@ class TransferObserver(Protocol):
 
     def transfer(self, t_ns: int, data: bytes) -> None:
         """A bulk transfer has ended."""
-        ...
 
     def state(self, t_ns: int, state: str) -> None:
         """The sensor's state has changed, or the skin was opened (OPENED)."""
-        ...
 
 
 class FrameStream(Protocol):
@@ -99,25 +91,20 @@ class FrameStream(Protocol):
     @property
     def loss_known(self) -> bool:
         """Whether every lost frame is seen, as the skin counts its frames."""
-        ...
 
     @property
     def clock(self) -> dict[str, float] | None:
         """Accuracy of the times: DeviceClock.quality."""
-        ...
 
     @property
     def misfit(self) -> str:
         """Why bytes are not frames, and the remedy, as far as it shows; "" if it does not."""
-        ...
 
     def restart(self) -> None:
         """Begin an enumeration: frame numbers get the next epoch, the clock starts again."""
-        ...
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
         """The frames in bytes that were read until `arrival_ns`. Raises SensorMismatch."""
-        ...
 
 
 class Readable(Protocol):
@@ -125,11 +112,9 @@ class Readable(Protocol):
 
     def read(self, size: int, timeout_ms: int) -> bytes:
         """At most `size` bytes; b"" if none came within `timeout_ms`."""
-        ...
 
     def close(self) -> None:
         """Ask the readout board to stop, unless it is gone, and release it."""
-        ...
 
 
 class SkinLink(Readable, Protocol):
@@ -137,7 +122,6 @@ class SkinLink(Readable, Protocol):
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """Send a request; returns a reply of at most `length` bytes, b"" for length 0."""
-        ...
 
 
 class BytePort(Readable, Protocol):

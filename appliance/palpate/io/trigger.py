@@ -35,7 +35,6 @@ class Trigger(Protocol):
 
     def edges(self, now_ns: int) -> list[Edge]:
         """Edges that are settled at `now_ns`, in order of time; never waits."""
-        ...
 
     @property
     def edge_counters(self) -> EdgeCounters: ...
@@ -43,17 +42,14 @@ class Trigger(Protocol):
     @property
     def about(self) -> dict[str, str]:
         """For sidecars. mode: `trigger.mode`. times: the origin of an edge's time."""
-        ...
 
     @property
     def blind(self) -> bool:
         """True after LOST, until the levels are known again."""
-        ...
 
     @property
     def due_ns(self) -> int:
         """Time at which a timed trigger starts or stops a sweep next; 0 if that is not planned."""
-        ...
 
 
 _Meaning = tuple[EdgeKind | None, EdgeKind | None]

@@ -255,7 +255,6 @@ class LinkSensor(ABC):
     @abstractmethod
     def _open(self) -> tuple[Readable, packets.Identity]:
         """Find, open, check and start the skin. Raises SensorError, with nothing left open."""
-        ...
 
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         """The trouble of a skin that sent no frame for `silence_ms`. bytes_came: it sent other
