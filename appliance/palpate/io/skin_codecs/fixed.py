@@ -107,9 +107,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         f"the {p.checksum} of {wrong} frames is wrong; correct checksum, checksum_from or"
         " checksum_order in its profile, or check the cable"
     )
-    found = frames.decoded(data, misfit if wrong else "")
-    left = Rest(found.rest.data, synced)
-    return replace(found, ends=found.ends + plan.tail, counts=np.array(counts, np.int64), rest=left)
+    found = frames.decoded(data, misfit if wrong else "", counts=np.array(counts, np.int64))
+    return replace(found, ends=found.ends + plan.tail, rest=Rest(found.rest.data, synced))
 
 
 def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:

@@ -136,37 +136,20 @@ class Gathering:
         whole = (steps == each * lengths).all() and (each == each[:1]).all()
         return bool(whole or (steps == steps[:1]).all())
 
-    def decoded(self, data: bytes, misfit: str = "") -> Decoded:
-        """What `data` holds; the rest begins with the current frame."""
-        left = Rest(data[self.begun :])
-        return collected(
-            *(self.profile, self.numbers, self.ends, self.skipped, self.garbage, left, self.size),
-            misfit=misfit,
+    def decoded(self, data: bytes, misfit: str = "", **more: Any) -> Decoded:
+        """What `data` holds; the rest begins with the current frame. more: as for Decoded."""
+        found = (
+            np.stack(self.numbers)
+            if self.numbers
+            else np.empty((0, self.profile.numbers), self.profile.data_type)
         )
-
-
-def collected(
-    profile: SkinProfile,
-    numbers: list[NDArray[Any]],
-    ends: list[int],
-    skipped: list[int],
-    garbage: int,
-    rest: Rest,
-    size: float,
-    **more: Any,
-) -> Decoded:
-    """Frames that were found one by one. numbers: of each frame, in the order of the wire."""
-    table = (
-        np.stack(numbers)
-        if numbers
-        else np.empty((0, profile.rows * profile.cols * profile.values), profile.data_type)
-    )
-    return Decoded(
-        arranged(profile, table),
-        np.array(ends, np.int64),
-        np.array(skipped, np.int64),
-        size,
-        garbage,
-        rest,
-        **more,
-    )
+        return Decoded(
+            arranged(self.profile, found),
+            np.array(self.ends, np.int64),
+            np.array(self.skipped, np.int64),
+            self.size,
+            self.garbage,
+            Rest(data[self.begun :]),
+            misfit=misfit,
+            **more,
+        )

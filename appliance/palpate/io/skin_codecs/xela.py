@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core.types import shown
-from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, collected
+from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Gathering, Rest
 from palpate.io.skin_profile import SkinProfile
 
 _XELA_BASE = 0x710
@@ -33,12 +31,10 @@ not a CAN frame."""
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """One CAN frame for each taxel, in the order of taxel numbers. A frame of the skin is complete
     with its last taxel. CAN frames of other nodes on the bus are passed over and counted."""
-    data, taxels = rest.data + new, profile.rows * profile.cols
-    numbers: list[NDArray[Any]] = []
-    ends, skipped = list[int](), list[int]()
+    data, taxels, frames = rest.data + new, profile.rows * profile.cols, Gathering(profile)
     found: list[bytes] = []  # the bytes of taxels 0, 1, 2, ... of the current frame
     lines: list[bytes] = []  # its lines
-    at = garbage = before = size = beyond = foreign = 0
+    at = before = beyond = foreign = 0
     while match := _LINE_END.search(data, at):
         line, at = data[at : match.end()], match.end()
         taxel, values = _taxel(line[:-1])
@@ -56,21 +52,20 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         if not (good and taxel == len(found)):
             # out of order, without a value, or damaged: the current frame is incomplete
             waste = sum(map(len, lines)) + len(line) * (not good or taxel > 0)
-            garbage, before, found, lines = garbage + waste, before + waste, [], []
+            frames.garbage, before, found, lines = frames.garbage + waste, before + waste, [], []
         if good and taxel == len(found):
             found.append(values)
             lines.append(line)
         if len(found) == taxels:
-            numbers.append(np.frombuffer(b"".join(found), ">u2"))
-            ends.append(at)
-            skipped.append(before)
-            size, before, found, lines = sum(map(len, lines)), 0, [], []
+            frames.numbers.append(np.frombuffer(b"".join(found), ">u2"))
+            frames.ends.append(at)
+            frames.skipped.append(before)
+            frames.size, before, found, lines = sum(map(len, lines)), 0, [], []
     left = b"".join(lines) + data[at:]
     if len(data) - at > MOST_PACKET:
-        garbage, left = garbage + len(left), b""
+        frames.garbage, left = frames.garbage + len(left), b""
     wrong = f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
-    more = {"wrong": wrong if beyond >= _WRONG_TAXELS else "", "foreign": foreign}
-    return collected(profile, numbers, ends, skipped, garbage, Rest(left), size, **more)
+    return frames.decoded(left, wrong=wrong if beyond >= _WRONG_TAXELS else "", foreign=foreign)
 
 
 def _taxel(line: bytes) -> tuple[int, bytes]:
