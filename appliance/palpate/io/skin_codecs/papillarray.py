@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.types import shown
-from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, arranged
+from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Gathering, Rest
 from palpate.io.skin_profile import SkinProfile
 
 _HEAD, _TAIL = bytes.fromhex("55667788"), bytes.fromhex("aabbccdd")
 _U16 = struct.Struct("<H")
-_CLOCK = np.dtype([("count", "<u4"), ("us", "<u8")])
+_CLOCK = struct.Struct("<IQ")
 _PILLAR, _TYPE = 26, 2
 """Bytes of a pillar: the uint16 _TYPE, and six float32."""
-_LOW_32 = np.uint64(0xFFFFFFFF)
 
 Span = tuple[int, int]
 
@@ -42,39 +41,33 @@ class PtsLayout:
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Packets between head and tail with a sum of their bytes; a tail may occur inside."""
-    data = rest.data + new
+    data, frames, counts, times_us = rest.data + new, Gathering(profile), list[int](), list[int]()
     spans, kept = _packets(data)
-    size = 4 * profile.numbers
-    numbers, clocks, taken = [np.empty(0, np.uint8)], [np.empty(0, np.uint8)], list[Span]()
-    wrong = ""
+    frames.garbage, wrong, before = kept, "", 0
     layout: PtsLayout | None = rest.layout
     for start, end in spans:
-        length = end - len(_TAIL) - 2 - start - len(_HEAD)
-        content = np.frombuffer(data, np.uint8, length, start + len(_HEAD))
-        if not (layout and layout.fits(content)):
-            layout = _layout(content.tobytes())
-        if layout and len(layout.numbers) == size:
-            numbers.append(content.take(layout.numbers))
-            clocks.append(content[layout.clock : layout.clock + _CLOCK.itemsize])
-            taken.append((start, end))
+        content = data[start + len(_HEAD) : end - len(_TAIL) - 2]
+        raw = np.frombuffer(content, np.uint8)
+        if not (layout and layout.fits(raw)):
+            layout = _layout(content)
+        if layout and len(layout.numbers) == 4 * profile.numbers:
+            frames.numbers.append(raw.take(layout.numbers).view("<f4"))
+            frames.skipped.append(start - before)
+            frames.ends.append(end)
+            frames.size = end - start
+            frames.garbage -= frames.size
+            count, us = _CLOCK.unpack_from(content, layout.clock)
+            counts.append(count)
+            times_us.append(us & 0xFFFFFFFF)
+            before = end
         elif layout:
             wrong = (
                 f"it sends {len(layout.numbers) // (_PILLAR - 2)} pillars, its profile says "
                 f"{shown((profile.rows, profile.cols))}"
             )
-    starts, ends = np.array(taken, np.int64).reshape(-1, 2).T
-    clock = np.concatenate(clocks).view(_CLOCK)
-    return Decoded(
-        arranged(profile, np.concatenate(numbers).view("<f4").reshape(-1, profile.numbers)),
-        ends,
-        starts - np.append(0, ends)[:-1],
-        taken[-1][1] - taken[-1][0] if taken else 0,
-        kept - int((ends - starts).sum()),
-        Rest(data[kept:], layout=layout),
-        clock["count"].astype(np.int64),
-        (clock["us"] & _LOW_32).astype(np.int64),
-        wrong,
-    )
+    clock = np.array(counts, np.int64), np.array(times_us, np.int64)
+    found = frames.decoded(data[kept:], wrong=wrong, counts=clock[0], times_us=clock[1])
+    return replace(found, rest=Rest(found.rest.data, layout=layout))
 
 
 def _packets(data: bytes) -> tuple[list[Span], int]:
@@ -113,7 +106,7 @@ def _layout(content: bytes) -> PtsLayout | None:
     try:
         blocks, fixed = _table(content)
         ends = dict(pairwise([*sorted(blocks.values()), len(content)]))
-        if ends[blocks[1]] - blocks[1] != _CLOCK.itemsize:
+        if ends[blocks[1]] - blocks[1] != _CLOCK.size:
             return None
         # the sum does not detect missing zero bytes; then block 4 no longer begins with the number
         # of sensors
