@@ -362,7 +362,7 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def adapted(profile: SkinProfile, config: SkinConfig) -> SkinProfile:
-    """The profile with skin.grid, skin.rate_hz and baud. Raises ConfigError."""
+    """The profile with skin.grid and skin.rate_hz. Raises ConfigError."""
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
         raise ConfigError(f"skin.{key} is announced by a skin of PROTOCOL.md; remove it")
@@ -379,8 +379,6 @@ def adapted(profile: SkinProfile, config: SkinConfig) -> SkinProfile:
             why = f"skin.rate_hz = {config.rate_hz:g} cannot be set on this skin"
             raise ConfigError(f"{why}; use one of {allowed}")
         changes["rate_hz"] = config.rate_hz
-    if config.baud:
-        changes["baud"] = config.baud
     return replace(profile, **changes)
 
 
