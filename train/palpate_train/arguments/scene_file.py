@@ -34,7 +34,8 @@ def words(path: Path, command: argparse.ArgumentParser) -> list[str]:
         option = f"--{key}"
         if option not in known:
             near = closest(option, tuple(known), cutoff=0.6)
-            hint = f"did you mean {near[0][2:]!r}?" if near else f"use {_listed(known)}"
+            every = ", ".join(name[2:] for name in known)
+            hint = f"did you mean {near[0][2:]!r}?" if near else f"use {every}"
             raise FormatError(f"{path.name}: key {key} is unknown; {hint}")
         found += _option(path, option, value, actions[option])
     return found
@@ -48,16 +49,13 @@ def _option(path: Path, option: str, value: Any, action: argparse.Action) -> lis
             raise _refused(path, option, value, "true or false")
         return [option] * value
     values = value if isinstance(value, list) and many else [value]
-    if not values or not all(_plain(one) for one in values):
+    plain = [isinstance(one, str | int | float) and not isinstance(one, bool) for one in values]
+    if not values or not all(plain):
         raise _refused(path, option, value, "a text or a number" + ", or a list of them" * many)
     texts = [_located(path, str(one)) if option in PATHS else str(one) for one in values]
     if action.nargs == "+":
         return [option, *texts]
     return [f"{option}={text}" for text in texts]
-
-
-def _plain(value: Any) -> bool:
-    return isinstance(value, str | int | float) and not isinstance(value, bool)
 
 
 def _located(path: Path, text: str) -> str:
@@ -72,7 +70,3 @@ def _located(path: Path, text: str) -> str:
 
 def _refused(path: Path, option: str, value: Any, use: str) -> FormatError:
     return FormatError(f"{path.name}: {option[2:]} = {value!r} is not allowed; use {use}")
-
-
-def _listed(options: list[str]) -> str:
-    return ", ".join(option[2:] for option in options)

@@ -92,28 +92,18 @@ def run_evaluate(args: argparse.Namespace) -> None:
             continue
         about = {"only": args.only, "each": args.each, "baselines": trivially[result.protocol]}
         results.append(result.json() | about)
-        _tell(results[-1], log)
+        say(evaluate.line(results[-1]))
+        if warning := trivial.above(results[-1]):
+            log.keep(f"palpate-train: {warning}")
         if args.json:
             results[-1] |= {"each_fold": result.each_fold()}
-            results.sort(
-                key=lambda r: (
-                    args.protocols.index(r["protocol"]),
-                    names.index(r["method"]),
-                    r["seed"],
-                )
-            )
+            test, method = args.protocols.index, names.index
+            results.sort(key=lambda r: (test(r["protocol"]), method(r["method"]), r["seed"]))
             _write(args.json, results)
     if refused:
         raise FormatError(
             f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why"
         )
-
-
-def _tell(result: dict[str, Any], log: options.Log) -> None:
-    """Print a result as a line, and a warning if a baseline is better."""
-    say(evaluate.line(result))
-    if warning := trivial.above(result):
-        log.keep(f"palpate-train: {warning}")
 
 
 def _beside(sweeps: Dataset, plan: evaluate.Plan, log: options.Log) -> dict[str, Any]:

@@ -82,8 +82,10 @@ def of(figures: Any) -> Provenance:
         """The values of these keys, part by part."""
         return [value for part in parts for key in keys for value in _list(part.get(key))]
 
+    # the id of a measured bundle stands alone or next to its name
     bundles = [
-        _bundle(part.get("bundle")) or (_texts(part.get("shipped")) if _has_default(part) else [])
+        _texts(bundle.get("id") if isinstance(bundle := part.get("bundle"), dict) else bundle)
+        or (_texts(part.get("shipped")) if _has_default(part) else [])
         for part in parts
     ]
     return Provenance(
@@ -145,11 +147,6 @@ def _parts(figures: Any) -> Iterator[dict[str, Any]]:
     )
     for value in values if isinstance(values, list) else ():
         yield from _parts(value)
-
-
-def _bundle(value: Any) -> list[str]:
-    """The id of a measured bundle, given alone or next to its name."""
-    return _texts(value.get("id") if isinstance(value, dict) else value)
 
 
 def _has_default(part: dict[str, Any]) -> bool:

@@ -73,7 +73,9 @@ def measured(
     some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
     with tempfile.TemporaryDirectory() as work:
         progress = Progress(len(names), log)
-        for method in [_briefly(name, effort) for name in names]:
+        brief = replace(effort, share=min(SHARE, effort.share))
+        every = (methods.find([name], effort if name in OURS else brief) for name in names)
+        for (method,) in list(every):
             progress.begin(f"{method.name} is trained for its time")
             try:
                 for entry, whole, call in _callable(
@@ -117,14 +119,6 @@ def of_panels(
 
 def _quantiles(times: Array) -> dict[str, float]:
     return {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
-
-
-def _briefly(name: str, effort: Effort) -> Method:
-    """The method, for a peer with SHARE of its iterations, unless the effort is smaller anyway."""
-    return methods.find(
-        [name],
-        effort if name in OURS else replace(effort, share=min(SHARE, effort.share)),
-    )[0]
 
 
 def _callable(method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path) -> list[Timed]:

@@ -54,7 +54,9 @@ def render(result: Json, name: str = "stress") -> Rendered:
         falls=fall_lines(curves, box),
         missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
-        refused=_refused(result["methods"]),
+        refused={
+            plain_name(k): of["refused"] for k, of in result["methods"].items() if of["refused"]
+        },
     )
 
 
@@ -104,13 +106,6 @@ def command(result: Json, name: str) -> str:
     words += ["--method", ",".join(result["methods"]), "--seeds", str(len(result["seeds"]))]
     words += ["--out", f"docs/data/{name}.json"] if name != "stress" else []
     return " ".join(words)
-
-
-def _refused(methods: Json) -> Json:
-    """The reason of each refused method, by its plain name."""
-    return {
-        plain_name(name): entry["refused"] for name, entry in methods.items() if entry["refused"]
-    }
 
 
 def first(curves: Json) -> tuple[list[str], int]:

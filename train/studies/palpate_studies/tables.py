@@ -176,7 +176,10 @@ MOVED = {
 def alignment(result: Json) -> str:
     """A line for each displacement of MOVED and for T-HARD, with 95 % intervals, under a caption
     with bundle, sets and commit."""
-    rows = [("T-HARD, a row ahead and all else anew", result["T-HARD"]), *_moved(result)]
+    rows = [("T-HARD, a row ahead and all else anew", result["T-HARD"])]
+    for direction, shown in MOVED.items():
+        at = {point["mm"]: point for point in result["moved"][direction]}
+        rows += [(text, at[mm]) for mm, text in shown if mm in at]
     caption = (
         f"Bundle {result['bundle']}, "
         f"commit {result['commit']}, {result['machine']}: {result['T-HARD']['n']} sweeps of "
@@ -186,13 +189,6 @@ def alignment(result: Json) -> str:
         "moved. Per cent [95 %], else sweeps."
     )
     return markdown.table(MOVED_HEAD, (_moved_cells(*row) for row in rows), caption)
-
-
-def _moved(result: Json) -> Iterator[tuple[str, Json]]:
-    for direction, shown in MOVED.items():
-        points: Sequence[Json] = result["moved"][direction]
-        for mm, text in shown:
-            yield from ((text, point) for point in points if point["mm"] == mm)
 
 
 def _moved_cells(text: str, point: Json) -> tuple[object, ...]:

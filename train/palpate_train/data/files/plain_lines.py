@@ -31,6 +31,7 @@ CELL = re.compile(r'"\[\s*([-+.\d][-+.\deE, ]*?)\s*\]"')
 OWN = re.compile(r"\(\s*\d+[.,]?\d*\s*\)\s*[;\t|]|\(\s*\d+(?:\.\d*)?\s*\)\s*,")
 """A number in parentheses of its own, as accountants write negative ones."""
 BRACKETS = re.compile(rf"^\s*(?!\[{_STAMP}\])(?:array|tensor)?\s*" + r"[\[({].*\d")
+ARRAY = re.compile(r"^\s*(array|tensor)")
 QUOTED = re.compile(r"'([^',;\t]*\d)'")
 HEXADECIMAL = re.compile(r"(?<![\w.])0[xX]([0-9a-fA-F]{1,8})(?![\w.])")
 FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d)")
@@ -67,7 +68,8 @@ def plain(lines: Sequence[str]) -> tuple[list[str], tuple[str, ...], list[str]]:
     names: tuple[str, ...] = ()
     if some and sum(map(_labelled, some)) >= USUAL * len(some):
         names = tuple(LABEL.findall(next(filter(_labelled, some))))
-        lines = [_unlabelled(line, names) for line in lines]
+        labels = [(line, tuple(LABEL.findall(line))) for line in lines]
+        lines = [LABEL.sub("", line) if found == names else line for line, found in labels]
     if some and sum(bool(CLOCK.match(line)) for line in some) >= USUAL * len(some):
         lines = [CLOCK.sub(_clocked, line) for line in lines]
         names = ("clock", *names) if names else ()
@@ -81,11 +83,6 @@ def _labelled(line: str) -> bool:
     return len(found) > 1 and len(found) == len(re.findall(r"[-+.\w]*\d[-+.\w]*", rest))
 
 
-def _unlabelled(line: str, names: Sequence[str]) -> str:
-    """The line without its labels, if these are `names` in their order."""
-    return LABEL.sub("", line) if tuple(LABEL.findall(line)) == names else line
-
-
 def _clocked(found: re.Match[str]) -> str:
     """The time as a cell of its own."""
     sign = next((s for s in (";", "\t", ",") if s in found[2]), " ")
@@ -95,14 +92,6 @@ def _clocked(found: re.Match[str]) -> str:
 def _spread(found: re.Match[str]) -> str:
     """The numbers of a list as cells."""
     return (";" if ";" in found.string else ",").join(found[1].replace(",", " ").split())
-
-
-def _separated(line: str) -> bool:
-    return any(sign in line for sign in ";\t|") and bool(BLANK_THOUSANDS.search(line))
-
-
-def _bracketed(line: str) -> bool:
-    return bool(BRACKETS.match(line)) and not OWN.search(line)
 
 
 def _one_unit(lines: Sequence[str]) -> None:
@@ -117,10 +106,6 @@ def _one_unit(lines: Sequence[str]) -> None:
                 raise FormatError(
                     f"line {i} has values in {unit}, line {at} in {first}; write one unit"
                 )
-
-
-def _unbracketed(line: str) -> str:
-    return re.sub(r"^\s*(array|tensor)", "", line).translate(_NO_BRACKETS).strip(" ,")
 
 
 @dataclass(frozen=True)
@@ -141,11 +126,20 @@ _REWRITINGS = (
     Rewriting("comments behind numbers", REMARK.search, partial(REMARK.sub, ""), True),
     Rewriting("marks of bytes", BYTES.search, partial(BYTES.sub, r"\2")),
     Rewriting("brackets of lists", CELL.search, partial(CELL.sub, _spread)),
-    Rewriting("brackets", _bracketed, _unbracketed),
+    Rewriting(
+        "brackets",
+        lambda line: BRACKETS.match(line) and not OWN.search(line),
+        lambda line: ARRAY.sub("", line).translate(_NO_BRACKETS).strip(" ,"),
+    ),
     Rewriting("single quotes", QUOTED.search, partial(QUOTED.sub, r"\1")),
     Rewriting("units of the cells", UNITS.search, partial(UNITS.sub, ""), check=_one_unit),
     Rewriting("separators of thousands", THOUSANDS.search, partial(THOUSANDS.sub, ""), True),
-    Rewriting("separators of thousands", _separated, partial(BLANK_THOUSANDS.sub, ""), True),
+    Rewriting(
+        "separators of thousands",
+        lambda line: any(sign in line for sign in ";\t|") and BLANK_THOUSANDS.search(line),
+        partial(BLANK_THOUSANDS.sub, ""),
+        True,
+    ),
     Rewriting("D in exponents", FORTRAN.search, partial(FORTRAN.sub, "e")),
     Rewriting(
         "marks of hexadecimal numbers",

@@ -480,19 +480,10 @@ def _columns(
         if c in layout.text_columns:
             texts[c] = [normal(cell) for cell in column]
             continue
-        bad = _into(values[:, c], column, decimal)
-        if bad is not None:
-            faults[c] = (
-                f"line {rows[bad][0]}, column {c + 1} is {excerpt(column[bad])}, "
-                "which is not a number"
-            )
+        for k, cell in enumerate(column):
+            if not is_number(cell, decimal):
+                at = f"line {rows[k][0]}, column {c + 1}"
+                faults[c] = f"{at} is {excerpt(cell)}, which is not a number"
+                break
+            values[k, c] = float(plain(cell, decimal))
     return values, texts, faults
-
-
-def _into(into: Array, column: Sequence[str], decimal: str) -> int | None:
-    """Write the numbers of a column; the index of the first cell that is not one."""
-    for k, cell in enumerate(column):
-        if not is_number(cell, decimal):
-            return k
-        into[k] = float(plain(cell, decimal))
-    return None
