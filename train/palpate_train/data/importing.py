@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
@@ -333,11 +334,9 @@ def _cuts(
     Recordings without a window are added to `left_out`.
     """
     rates = []
-    for one in list(recordings):
-        try:
+    for one in recordings:
+        with suppress(FormatError):  # the recording is left out below, with its reason
             rates += [sampling.measured_hz(one.time_s)] if one.time_s is not None else []
-        except FormatError:
-            continue  # the recording is left out below, with its reason
     rate_hz = plan.rate_hz or (sampling.nominal_hz(np.array(rates)) if rates else 1.0)
     cuts = []
     for one in recordings:

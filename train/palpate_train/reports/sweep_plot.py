@@ -232,7 +232,9 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
         shades = _skin(figure, sweep, taxels)
     missing = "; grey bars: frames are missing" if len(sweep.gaps) else ""
     _caption(page, SKIN[1] + 0.52, f"raw counts over {sweep.since}{shades}{missing}")
-    first, longest = max(_runs(sweep, taxels), key=lambda run: len(run[1]))
+    starts = np.append(0, sweep.gaps + 1)
+    runs = zip(starts, np.split(taxels, starts[1:]), strict=True)  # between missing frames
+    first, longest = max(runs, key=lambda run: len(run[1]))
     moving = longest[
         :, np.ptp(longest, axis=0) > 0
     ]  # the others have no place on a logarithmic axis
@@ -253,12 +255,6 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
         )
     _caption(page, SPECTROGRAM[0] - 0.13, text)
     return to_svg(figure, f"one sweep: {printable(sweep.title, '�')}", plain=plain)
-
-
-def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
-    """The parts [n, taxels] between missing frames, each with the number of its first frame."""
-    starts = [0, *(int(frame) + 1 for frame in sweep.gaps)]
-    return list(zip(starts, np.split(taxels, sweep.gaps + 1), strict=True))
 
 
 def _about_spectrum(format: SweepFormat, still: int) -> str:

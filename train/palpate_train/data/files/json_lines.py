@@ -16,8 +16,8 @@ from palpate_train.data.files.table import (
     ReadPlan,
     Table,
     excerpt,
+    facts_of,
     from_columns,
-    normal,
     timed,
 )
 from palpate_train.data.files.text import decoded, lines_of
@@ -33,12 +33,10 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     whole, facts = _whole(text), dict[str, str]()
     acquired: dict[str, Any] | None = None
     if isinstance(whole, dict):
-        facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
+        facts = facts_of(whole)
         if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
             acquired, whole = inner, _acquired(inner)
-            facts |= {
-                normal(k): str(v) for k, v in inner.items() if isinstance(v, str | int | float)
-            }
+            facts |= facts_of(inner)
         else:
             whole, said = _unwrapped(whole, wanted)
             notes += said

@@ -131,6 +131,11 @@ def timed(table: Table, key: str, stated: Any, unit_s: float = 1.0) -> Table:
     )
 
 
+def facts_of(said: Mapping[str, Any]) -> dict[str, str]:
+    """The texts and numbers in an object or in attributes, as facts."""
+    return {normal(k): str(v) for k, v in said.items() if isinstance(v, str | int | float)}
+
+
 def excerpt(text: str) -> str:
     """A cell as it is shown in an error message."""
     return repr(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…")

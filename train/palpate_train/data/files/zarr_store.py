@@ -14,7 +14,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal, unpacked
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, facts_of, unpacked
 
 SUFFIXES = (".zarr",)
 ROOTS = (".zgroup", ".zarray", "zarr.json")
@@ -69,8 +69,7 @@ def _read(root: Any, wanted: ReadPlan) -> Table:
         if path not in arrays and path != name and (not at or f"{at}/".startswith(f"{path}/"))
     ]
     said = {k: v for group in groups for k, v in dict(group.attrs).items()}
-    facts = {normal(k): str(v) for k, v in said.items() if isinstance(v, str | int | float)}
-    return replace(table, facts=facts)
+    return replace(table, facts=facts_of(said))
 
 
 def _all(array: Any) -> Array:
