@@ -93,7 +93,8 @@ class Offered:
         usual = {"source": "usb", "bundle": "9f3c2a1b", "labels": labels, "skin": "palpate"}
         known = usual | known
         self.cost_ns = self._spent_ns = 0
-        self.feed = FeedServer(path, format, known, self.clock, lambda: facts, self._spent)
+        told = {name: lambda value=value: value for name, value in facts.items()}
+        self.feed = FeedServer(path, format, known, self.clock, told, self._spent)
 
     def turns(
         self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND

@@ -26,7 +26,7 @@ from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command
 from palpate.runtime import assembly
-from palpate.runtime.reporting import capture, done, feed, status
+from palpate.runtime.reporting import capture, done, reports
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
@@ -97,8 +97,7 @@ def _observers(
         Notifier(SystemClock()),
         recording,
         *([SweepPrinter(sys.stdout, recording.about)] if sys.stdout.isatty() else []),
-        *status(settings, facts),
-        *feed(settings, format, source, {"bundle": "", "labels": []}, facts),
+        *reports(settings, format, source, {"bundle": "", "labels": []}, facts),
     ]
 
 

@@ -26,7 +26,7 @@ from palpate.inference.classifier import Classifier
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
-from palpate.runtime.reporting import capture, done, feed, status
+from palpate.runtime.reporting import capture, done, reports
 from palpate.service import last_failure
 from palpate.service.systemd import Notifier, VerdictLog
 
@@ -139,8 +139,7 @@ def _reports(settings: Config, current: Bundle, source: str, facts: Facts) -> li
     expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     known |= {"displays": m.displays} if m.displays else {}
-    reports = status(settings, facts), feed(settings, current.format, source, known, facts)
-    return [*observers, *reports[0], *reports[1]]
+    return [*observers, *reports(settings, current.format, source, known, facts)]
 
 
 def _named(m: Manifest) -> str:

@@ -29,8 +29,7 @@ from palpate.learn import install, materials
 from palpate.learn.enrolment import slide_check
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
-from palpate.runtime.loop import Box
-from palpate.runtime.reporting import capture, feed, status
+from palpate.runtime.reporting import capture, reports
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
@@ -96,7 +95,8 @@ class TeachingProgram:
 
     def obey(self, command: Command) -> Reply:
         """Carry out an order of the page, in the loop's thread."""
-        return self._phase.obey(command)
+        own = self._phase.orders.get(command.name)
+        return own(command.text) if own else self._phase.box.obey(command)
 
     def run(self, pages: Sequence[Observer], address: str) -> None:
         """Run until all sweeps are recorded; with pages, at `address`, until DONE."""
@@ -120,19 +120,9 @@ class TeachingProgram:
         return {name: act if allowed else _forbidden for name, act in commands.items()}
 
 
-class Phase:
-    """A part of the program with its box. orders: of the page, tried before commands of the box."""
-
-    box: Box
-    orders: Mapping[str, CommandHandler]
-
-    def obey(self, command: Command) -> Reply:
-        own = self.orders.get(command.name)
-        return own(command.text) if own else self.box.obey(command)
-
-
-class RecordingPhase(Phase):
-    """Records and assesses. `stack` closes it."""
+class RecordingPhase:
+    """Records and assesses. `stack` closes it. orders: of the page, tried before commands of the
+    box."""
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
         self._program, lesson, devices = program, program.lesson, program.devices
@@ -215,12 +205,11 @@ class RecordingPhase(Phase):
             *([HandOver(runtime, SystemClock())] if runtime else []),
             self._recording,
             self._session,
-            *status(settings, facts),
-            *feed(settings, program.format, program.devices.source, nothing, facts),
+            *reports(settings, program.format, program.devices.source, nothing, facts),
         ]
 
 
-class TryingPhase(Phase):
+class TryingPhase:
     """Classifies with the new bundle, on trial as in the service. `stack` closes it."""
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
@@ -238,8 +227,7 @@ class TryingPhase(Phase):
         again = {"TEACH": self._teach_again}
         self.orders = {**again, "DONE": program.finish}
         known = {"bundle": choice.bundle.id, "labels": m.labels, "displays": m.displays}
-        source = program.devices.source
-        shown = *status(settings, facts), *feed(settings, m.format, source, known, facts)
+        shown = reports(settings, m.format, program.devices.source, known, facts)
         self.box = assembly.box(
             *(settings, choice.bundle, program.devices, port, stack),
             observers=[disk, Notifier(SystemClock()), *trial, *shown, *program.pages],

@@ -37,30 +37,20 @@ def done(
     return lambda: box.answered >= most or stopped() or devices.finished(box.answered)
 
 
-def status(settings: Config, facts: Facts) -> list[Observer]:
-    """The writer of the status file, if the settings name a file that can be written."""
-    path = settings.store.status
-    if not path or not os.access(path.parent, os.W_OK):
-        return []
-    return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
-
-
-def feed(
-    settings: Config,
-    format: SweepFormat,
-    source: str,
-    model: Mapping[str, Any],
-    facts: Facts,
+def reports(
+    settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
 ) -> list[Observer]:
-    """The server of the feed, if the settings name its folder. The default folder exists in a
-    service only. model: facts about the bundle for the first line of the feed."""
-    path = settings.store.feed
+    """The writer of the status file and the server of the feed, if the settings name them. The
+    default folder exists in a service only. model: facts about the bundle for the first line of
+    the feed."""
+    status, feed, made = settings.store.status, settings.store.feed, list[Observer]()
+    if status and os.access(status.parent, os.W_OK):
+        made.append(StatusFile(status, SystemClock(), facts))
     default = settings.sources["store.runtime"] == "code"
-    if not path or (default and not os.access(path.parent, os.W_OK)):
-        return []
-    from palpate.service.feed import FeedServer
+    if feed and (not default or os.access(feed.parent, os.W_OK)):
+        from palpate.service.feed import FeedServer
 
-    known = {"source": source, "skin": settings.skin.profile, **model}
-    known["unit"] = skins.profile(settings).unit
-    more = lambda: {name: fact() for name, fact in facts.items()}  # noqa: E731
-    return [FeedServer(path, format, known, SystemClock(), more)]
+        known = {"source": source, "skin": settings.skin.profile, **model}
+        known["unit"] = skins.profile(settings).unit
+        made.append(FeedServer(feed, format, known, SystemClock(), facts))
+    return made

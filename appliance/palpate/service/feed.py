@@ -22,7 +22,7 @@ from palpate import __version__
 from palpate.core.clock import Clock
 from palpate.core.errors import FormatError
 from palpate.core.log import TroubleLog
-from palpate.core.observer import Health, Observer
+from palpate.core.observer import Facts, Health, Observer
 from palpate.core.runtime_folder import FEED_SCHEMA
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.service.feed_reader import MOST_HZ, QUEUE_BYTES, Reader, encode, sweep_line
@@ -57,23 +57,23 @@ class FeedServer(Observer):
 
     A *round* takes up a connection, requests of some readers, and sends to all.
 
-    format: of the sweeps. facts: source, bundle, labels and skin for the first line (PROTOCOL.md).
-    clock, more: as for Report. spent_ns: processor time that this thread has used so far.
+    format: of the sweeps. known: source, bundle, labels and skin for the first line (PROTOCOL.md).
+    clock, facts: as for Report. spent_ns: processor time that this thread has used so far.
     """
 
     def __init__(
         self,
         path: Path,
         format: SweepFormat,
-        facts: Mapping[str, Any],
+        known: Mapping[str, Any],
         clock: Clock,
-        more: Callable[[], Mapping[str, Any]] = dict,
+        facts: Facts,
         spent_ns: Callable[[], int] = time.thread_time_ns,
     ) -> None:
         self._path, self._clock, self._spent_ns = path, clock, spent_ns
-        self._report = Report(clock, more)
+        self._report = Report(clock, facts)
         self._most_hz = min(MOST_HZ, MOST_VALUES_S / format.channels)
-        self._hello = _hello(format, facts, self._most_hz)
+        self._hello = _hello(format, known, self._most_hz)
         self._listener: socket.socket | None = None
         self._poll = select.epoll()
         self._readers: dict[int, Reader] = {}
@@ -252,10 +252,10 @@ class FeedServer(Observer):
         reader.close(why)
 
 
-def _hello(format: SweepFormat, facts: Mapping[str, Any], most_hz: float) -> bytes:
+def _hello(format: SweepFormat, known: Mapping[str, Any], most_hz: float) -> bytes:
     program = {"schema": FEED_SCHEMA, "version": __version__, "pid": os.getpid()}
     sweeps = {"format": format.json(), "window_s": format.window / format.rate_hz}
-    return encode("hello", {**program, **facts, **sweeps, "frames_hz": most_hz})
+    return encode("hello", {**program, **known, **sweeps, "frames_hz": most_hz})
 
 
 def _due(share: float, before: int, tick: int) -> bool:

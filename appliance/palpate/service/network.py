@@ -89,7 +89,13 @@ def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], No
             one = zeroconf.Zeroconf(zeroconf.InterfaceChoice.All if every else [host])
             opened.append(one)
             hosts = own_addresses() if every else [host]
-            one.register_service(_info(box, kind, hosts, port), allow_name_change=True)
+            info = zeroconf.ServiceInfo(
+                *(TYPE, f"{box} {kind}.{TYPE}", port),
+                parsed_addresses=[one for one in hosts if not local(one)],
+                properties={"kind": kind, "version": __version__},
+                server=f"palpate-{box}.local.",
+            )
+            one.register_service(info, allow_name_change=True)
         except (OSError, zeroconf.Error) as e:
             log.warning(f"{kind}: not announced ({e}); give its address to the clients")
         ended.wait()
@@ -104,17 +110,6 @@ def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], No
         thread.join(LISTEN_S)
 
     return end
-
-
-def _info(box: str, kind: str, hosts: list[str], port: int) -> Any:
-    import zeroconf
-
-    return zeroconf.ServiceInfo(
-        *(TYPE, f"{box} {kind}.{TYPE}", port),
-        parsed_addresses=[host for host in hosts if not local(host)],
-        properties={"kind": kind, "version": __version__},
-        server=f"palpate-{box}.local.",
-    )
 
 
 def found(clock: Clock, interfaces: list[str] | None = None) -> list[Reachable]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 from collections import deque
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from palpate import __version__
 from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.log import TroubleLog
-from palpate.core.observer import Health, Observer
+from palpate.core.observer import Facts, Health, Observer
 from palpate.core.types import Verdict
 from palpate.service.status import SCHEMA, VERDICTS
 
@@ -29,17 +28,17 @@ SOON_NS = 100_000_000
 class Report:
     """The state of the box as an object for JSON, in the status file and in the feed.
 
-    clock: the real clock of the host, which a reader in another process shares. more: further facts
-    for JSON; `lines` shows each text among them as a line of its own, unless it is empty.
+    clock: the real clock of the host, which a reader in another process shares. facts: `lines`
+    shows each text among them as a line of its own, unless it is empty.
     """
 
-    def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
-        self._clock, self._more = clock, more
+    def __init__(self, clock: Clock, facts: Facts) -> None:
+        self._clock, self._facts = clock, facts
         self._since_ns = clock.now_ns()
 
     def __call__(self, health: Health) -> dict[str, Any]:
         return {
-            **self._more(),
+            **{name: fact() for name, fact in self._facts.items()},
             **health._asdict(),
             "time_ns": self._clock.now_ns(),
             "since_ns": self._since_ns,
@@ -52,13 +51,11 @@ class StatusFile(Observer):
     """Writes the state of the box and its latest answers. The file is removed when the program ends
     in order.
 
-    clock, more: as for Report.
+    clock, facts: as for Report.
     """
 
-    def __init__(
-        self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict
-    ) -> None:
-        self._path, self._clock, self._report = path, clock, Report(clock, more)
+    def __init__(self, path: Path, clock: Clock, facts: Facts) -> None:
+        self._path, self._clock, self._report = path, clock, Report(clock, facts)
         self._next_ns = clock.now_ns()
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
         self._fresh, self._skin = False, ""

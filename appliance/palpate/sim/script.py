@@ -72,24 +72,18 @@ def named(
     """
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
-        able: list[tuple[SweepFormat, skin.World, Any]] = [
-            (world.format, world, skin) for world in (PLAYED, replace(PLAYED, shear=True))
-        ]
-        if seen:
-            able = [(seen.FORMAT, PLAYED, seen)]
-        format = format or able[0][0]
-        fits = [
-            one for one in able if (one[0].skin, one[0].rate_hz) == (format.skin, format.rate_hz)
-        ]
+        worlds = {one.format: one for one in (PLAYED, replace(PLAYED, shear=True))}
+        able = {seen.FORMAT: PLAYED} if seen else worlds
+        format = format or next(iter(able))
+        wanted = format.skin, format.rate_hz
+        fits = [world for one, world in able.items() if (one.skin, one.rate_hz) == wanted]
         if not fits:
-            sent = " or ".join(str(one) for one, _, _ in able)
-            hint = _NAME_BUNDLE if seen else _NAME_SKIN
+            sent, hint = " or ".join(map(str, able)), _NAME_BUNDLE if seen else _NAME_SKIN
             raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
-        _, world, by = fits[0]
         if name == "rest":
-            return rests(seed, world, by), "sim", format
+            return rests(seed, fits[0], seen or skin), "sim", format
         slide_s = FOLLOWED_S if follows else SLIDE_S
-        acts = tubes(seed, world=world, seen=by, only=only, slide_s=slide_s)
+        acts = tubes(seed, world=fits[0], seen=seen or skin, only=only, slide_s=slide_s)
         return acts, "sim", format
     if name.startswith(SETS):
         sweeps = load(Path(name.removeprefix(SETS)), format)

@@ -38,7 +38,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats(settings):
     def streaming(settings: Config, health: Health | None) -> object:
         """The format that an install learns from a service in this state; None without it."""
         if health:
-            StatusFile(settings.store.status, SystemClock()).turn(health)
+            StatusFile(settings.store.status, SystemClock(), {}).turn(health)
         return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
 
     assert streaming(settings, None) is None
@@ -69,7 +69,7 @@ def test_the_command_refuses_it_unless_it_is_told(tmp_path, capsys):
     ).json()
     folder = box.copied(deliveries.signed(held, box.key))
     how = {"folder": box.how.folder, "keys": box.how.keys, "runtime": tmp_path}
-    StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
+    StatusFile(tmp_path / "status.json", SystemClock(), {}).turn(HEALTH)
     command = [
         "bundles",
         "install",

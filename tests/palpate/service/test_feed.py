@@ -522,7 +522,7 @@ def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged, tmp_path):
     """On simulated devices, as the robot and the box."""
     simulated = tubes(1)
     path = tmp_path / "feed.sock"
-    feed = FeedServer(path, skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0)
+    feed = FeedServer(path, skin.FORMAT, {"source": "sim"}, simulated.clock, {}, lambda: 0)
     box = rigged(simulated, observers=[feed])
     box.box.step()
     peer = FeedPeer(path)

@@ -36,9 +36,10 @@ SHORT = replace(
 class ClockedStatus:
     """A status file on a virtual clock."""
 
-    def __init__(self, folder: Path, **more: object) -> None:
+    def __init__(self, folder: Path, **facts: object) -> None:
         self.clock, self.path = rig.VirtualClock(), folder / "status.json"
-        self.file = StatusFile(self.path, self.clock, **more)
+        held = {name: lambda value=value: value for name, value in facts.items()}
+        self.file = StatusFile(self.path, self.clock, held)
 
     def turns(self, seconds: float, health: Health = HEALTH, step_s: float = 0.01) -> int:
         """Take turns; how often the file was written anew."""
@@ -100,8 +101,8 @@ def test_every_user_may_read_it_whole(status_file):
 
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path):
     """Newest verdict first; advice where something is wrong."""
-    more = {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
-    status_file = ClockedStatus(tmp_path, more=lambda: more)
+    facts = {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
+    status_file = ClockedStatus(tmp_path, **facts)
     moved = "moved 2.1 mm too far towards row 4"
     for verdict in (replace(OK, sweep=6, detail=moved), OK, SHORT):
         status_file.file.answered(verdict)
@@ -113,7 +114,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path):
         ["skin", "streaming", "(5,000,000", "frames,", "3", "lost)"],
         ["bundle", "9f3c2a1b"],
         ["sweeps", "7", "answered"],
-        ["trial", *more["trial"].split()],
+        ["trial", *facts["trial"].split()],
     ]
     assert [line.split()[1] for line in text[4:]] == ["8", "7", "6"]
     assert "short" in text[4]
@@ -258,7 +259,7 @@ def asleep(box: Rigged) -> None:
 def test_what_is_counted_is_shown(rigged, tmp_path, name, field, fault, text):
     """In STA, STATE, file and words, and not before it."""
     simulated = idle_devices(60)
-    file = StatusFile(tmp_path / "status.json", simulated.clock)
+    file = StatusFile(tmp_path / "status.json", simulated.clock, {})
     sets = ("trigger.storm_edges=50",) if name == "storms" else ()
     box = rigged(simulated, sets, observers=[file])
     box.seconds(1.5)

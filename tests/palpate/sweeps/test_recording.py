@@ -181,7 +181,7 @@ def test_speed_and_force_reach_sidecar_feed_and_set(rigged, tmp_path):
     acts = [rig.Act(numbered(20 * 750), 10**7, 10**7 + 1, "")]
     simulated = played(acts)
     session = RecordingSession(tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None)
-    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {}, simulated.clock)
+    feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {}, simulated.clock, {})
     sets = ("trigger.mode=serial",)
     box = rigged(simulated, sets, observers=[session, feed], commands=session.commands)
     box.seconds(0.5)

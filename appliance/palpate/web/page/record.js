@@ -2,14 +2,11 @@
 
 import {byId, changed, enable, fill, made, put} from "./parts.js";
 import {spectrogram} from "./plots.js";
-import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen} from "./recording.js";
+import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen, shown} from "./recording.js";
 import {SkinPicture} from "./skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
 let view, drawn = {};
-
-/* A material by the name that people read. */
-function shown(material) { return seen.recording?.displays?.[material] ?? material; }
 
 function named(material, position) { return material ? shown(material) + (position && ` at ${position}`) : "no material"; }
 
@@ -24,7 +21,7 @@ function drawLabels() {
     drawn[name] = value;
   }
   put("trigger", recording.trigger);
-  drawMoves(shown, byId("material").value.trim());
+  drawMoves(byId("material").value.trim());
   byId("sweeps").hidden = !recording.commands.includes("START");
   enable(byId("start"), may() && recording.ready && Boolean(recording.material));
   enable(byId("stop"), may() && recording.sweeping);

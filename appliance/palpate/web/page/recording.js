@@ -41,11 +41,14 @@ export function drawHeader() {
   if (recording) put("format", recording.format);
 }
 
+/* A material by the name that people read. */
+export function shown(material) { return (seen.recording?.trying ?? seen.recording)?.displays?.[material] ?? material; }
+
 /* The start page on the same machine. */
 export function startAddress() { return `${location.protocol}//${location.hostname}:8137/`; }
 
 /* The buttons of a sweep with the wrong material, and of a material with the wrong name. typed: a new name. */
-export function drawMoves(shown, typed) {
+export function drawMoves(typed) {
   const {recording} = seen, {newest, material, undo} = recording;
   byId("move").hidden = !newest || !material || newest[1] === material;
   put("move", newest ? `Move sweep ${recording.discard} to ${shown(material)}` : "Move");

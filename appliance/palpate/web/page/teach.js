@@ -1,16 +1,13 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
 import {ago, byId, changed, enable, fill, made, percentAtMost, put} from "./parts.js";
-import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen, startAddress} from "./recording.js";
+import {drawHeader, drawLast, drawMoves, live, may, ordered, run, seen, shown, startAddress} from "./recording.js";
 
 const STEPS = {start: "waiting for the processor", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 const NOT_THIS = "not this"; // the material of sweeps over other things, which move the limit of unknown ones
 let ended = false, usedMs = 0;
 
 function teach() { return seen.recording?.teach ?? null; }
-
-/* A material by the name that people read. */
-function shown(name) { return (seen.recording?.trying ?? seen.recording)?.displays?.[name] ?? name; }
 
 function byPage() { return seen.recording?.commands.includes("START"); }
 
@@ -31,7 +28,7 @@ function drawTask() {
   put("sweep-button", recording.sweeping ? "Stop" : "Start");
   enable(byId("sweep-button"), may() && recording.skin === "streaming" && (trying || Boolean(name)));
   for (const id of ["discard", "move", "skip", "place", "rename", "undo"]) byId(id).hidden = Boolean(trying);
-  if (!trying) drawMoves(shown, byId("name").value.trim());
+  if (!trying) drawMoves(byId("name").value.trim());
   enable(byId("discard"), may() && recording.discard != null);
   put("discard", recording.discard == null ? "Discard" : `Discard sweep ${recording.discard}`);
   enable(byId("skip"), may("teach") && now && Object.keys(now.materials).length > 1);
