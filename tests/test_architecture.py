@@ -36,7 +36,6 @@ ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2",
 EXTRAS = {
     "web": {"tornado"},
     "bridges/mqtt.py": {"paho"},
-    "bridges/mqtt_broker.py": {"paho"},
     "service/network.py": {"zeroconf", "ifaddr"},
     "bridges/opcua.py": {"asyncua"},
     "bridges/opcua_model.py": {"asyncua"},

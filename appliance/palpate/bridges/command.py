@@ -28,12 +28,11 @@ def run_mqtt(args: argparse.Namespace) -> int:
     """`palpate bridge mqtt`, until SIGTERM. Raises ConfigError without paho or a broker."""
     with needed("the MQTT client", "mqtt", "urllib.request"):
         from palpate.bridges import mqtt
-        from palpate.bridges.mqtt_broker import broker
 
     settle("mqtt", args, config.load(None))
     name, stopped = network.box_name(args.name), StopFlag()
     warn_of(args)
-    to = broker(args.broker, args.login, args.ca)
+    to = mqtt.broker(args.broker, args.login, args.ca)
     bridge = mqtt.MqttBridge(to, name, args, SystemClock(), stopped)
     says = "are passed on" if args.allow_writes else "are refused (--allow-writes)"
     log.info(f"mqtt: box at {bridge.source.name}, topics palpate/{name}; commands {says}")
@@ -76,7 +75,6 @@ def feeds(given: Sequence[str]) -> dict[str, Feed]:
 
 
 def run_fuse(args: argparse.Namespace) -> int:
-    """`palpate bridge fuse`, until SIGTERM."""
     from palpate.bridges.fuse import UNSURE, FingerFusion, listen
 
     settings, clock = config.load(None), SystemClock()
@@ -157,7 +155,6 @@ RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
 
 
 def run(args: argparse.Namespace) -> int:
-    """`palpate bridge KIND`."""
     return RUNS[args.kind](args)
 
 

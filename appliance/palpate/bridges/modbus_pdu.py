@@ -90,7 +90,6 @@ def reply(request: ModbusRequest, pdu: bytes) -> bytes:
 
 
 def refusal(pdu: bytes, fault: ExceptionCode) -> bytes:
-    """The reply with an exception code."""
     return bytes([pdu[0] | 0x80, fault])
 
 

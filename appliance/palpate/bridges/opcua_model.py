@@ -95,7 +95,6 @@ def numbers(
 
 
 def state(view: BoxView) -> dict[str, Any]:
-    """The values of STATE."""
     one = view.state
     ready = bool(one and one.ready)
     moving = bool(one and one.sweeping)

@@ -238,7 +238,6 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         return answer
 
     def _array(self, *statuses: DiagnosticStatus) -> DiagnosticArray:
-        """Statuses with time and frame."""
         array = DiagnosticArray(status=[*statuses])
         array.header.stamp = self.get_clock().now().to_msg()
         array.header.frame_id = self.setting("frame_id")

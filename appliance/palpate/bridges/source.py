@@ -162,7 +162,6 @@ class FeedSource:
         self.client()
 
     def client(self) -> NoReturn:
-        """Raises CommandRefused: the feed is read-only."""
         raise CommandRefused(
             "the feed is read-only; give the bridge a serial line with --port or --link"
         )

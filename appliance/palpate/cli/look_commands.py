@@ -63,9 +63,8 @@ def run_watch(args: argparse.Namespace) -> int:
     socket, stopped = settings.store.needed_feed(), StopFlag()
     if args.web is not None:
         from palpate.web.access import Access
-        from palpate.web.boxes import OtherBoxes
         from palpate.web.history import History
-        from palpate.web.web import PageWatcher
+        from palpate.web.web import OtherBoxes, PageWatcher
 
         access = Access.configured(settings.watch, args.web)
         history = History(Path(settings.bridge.memory), settings.watch.shifts)

@@ -26,7 +26,6 @@ from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command
 from palpate.runtime import assembly
-from palpate.runtime.reporting import capture, done, reports
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
@@ -54,14 +53,14 @@ def run(args: argparse.Namespace) -> int:
         check = SweepCheck(format, devices.clock, SlidesBefore(format, recording))
         box = assembly.assembled(
             *(settings, check, devices, port, stack),
-            capture=capture(args.capture, settings, format, stack),
+            capture=assembly.capture(args.capture, settings, format, stack),
             observers=[disk, *reports, *pages],
             commands=recording.commands,
             ordered=bool(pages),
         )
         for shown in pages:
             stack.enter_context(shown)
-        box.run(done(args.sweeps, box, devices, stopped))
+        box.run(assembly.done(args.sweeps, box, devices, stopped))
     return stopped.exit_code
 
 
@@ -97,7 +96,7 @@ def _observers(
         Notifier(SystemClock()),
         recording,
         *([SweepPrinter(sys.stdout, recording.about)] if sys.stdout.isatty() else []),
-        *reports(settings, format, source, {"bundle": "", "labels": []}, facts),
+        *assembly.reports(settings, format, source, {"bundle": "", "labels": []}, facts),
     ]
 
 

@@ -26,7 +26,6 @@ from palpate.inference.classifier import Classifier
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
-from palpate.runtime.reporting import capture, done, reports
 from palpate.service import last_failure
 from palpate.service.systemd import Notifier, VerdictLog
 
@@ -90,10 +89,10 @@ def _classify(
         reports = _reports(settings, current, devices.source, facts)
         watching = Notifier(SystemClock()), trial, release, shadow, kept, compared, *reports
         observers = [disk, *filter(None, watching)]
-        recorded = capture(args.capture, settings, current.format, stack)
+        recorded = assembly.capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack
         box = assembly.box(*parts, capture=recorded, observers=observers)
-        ended = done(args.sweeps, box, devices, stopped)
+        ended = assembly.done(args.sweeps, box, devices, stopped)
         box.run(lambda: ended() or bool(release and release.over))
     return stopped.exit_code
 
@@ -139,7 +138,7 @@ def _reports(settings: Config, current: Bundle, source: str, facts: Facts) -> li
     expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     known |= {"displays": m.displays} if m.displays else {}
-    return [*observers, *reports(settings, current.format, source, known, facts)]
+    return [*observers, *assembly.reports(settings, current.format, source, known, facts)]
 
 
 def _named(m: Manifest) -> str:

@@ -158,7 +158,6 @@ class Palpate:
         return BoxState.of(self.ask("STATE", timeout_s=timeout_s))
 
     def identify(self) -> BoxIdentity:
-        """Bundle and skin of the box."""
         return BoxIdentity.of(self.ask("ID"))
 
     def labels(self) -> tuple[str, ...]:

@@ -29,7 +29,6 @@ from palpate.learn import install, materials
 from palpate.learn.enrolment import slide_check
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
-from palpate.runtime.reporting import capture, reports
 from palpate.service.systemd import Notifier
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_check import SlidesBefore, SweepCheck
@@ -143,7 +142,7 @@ class RecordingPhase:
         check = SweepCheck(program.format, devices.clock, self._slides(), teaching=True)
         self.box = assembly.assembled(
             *(settings, check, devices, port, stack),
-            capture=capture(lesson.capture, settings, program.format, stack),
+            capture=assembly.capture(lesson.capture, settings, program.format, stack),
             observers=[disk, *self._observers(), self._teacher, *pages],
             commands=program.by_robot({**session.recording_commands, **session.commands}),
             ordered=bool(pages or lesson.waits),
@@ -205,7 +204,7 @@ class RecordingPhase:
             *([HandOver(runtime, SystemClock())] if runtime else []),
             self._recording,
             self._session,
-            *reports(settings, program.format, program.devices.source, nothing, facts),
+            *assembly.reports(settings, program.format, program.devices.source, nothing, facts),
         ]
 
 
@@ -227,7 +226,7 @@ class TryingPhase:
         again = {"TEACH": self._teach_again}
         self.orders = {**again, "DONE": program.finish}
         known = {"bundle": choice.bundle.id, "labels": m.labels, "displays": m.displays}
-        shown = reports(settings, m.format, program.devices.source, known, facts)
+        shown = assembly.reports(settings, m.format, program.devices.source, known, facts)
         self.box = assembly.box(
             *(settings, choice.bundle, program.devices, port, stack),
             observers=[disk, Notifier(SystemClock()), *trial, *shown, *program.pages],

@@ -1,9 +1,11 @@
-"""Assembles a Box from settings, devices, and a bundle if there is one."""
+"""Assembles a Box from settings, devices, and a bundle if there is one; and what every running box
+reports."""
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -17,7 +19,7 @@ from palpate.core.config import Config, TriggerConfig
 from palpate.core.devices import Devices
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.log import in_journal, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Facts, Observer
 from palpate.core.sentences import CommandHandler
 from palpate.core.types import SweepFormat
 from palpate.deployment.sandbox import run_limited
@@ -37,6 +39,7 @@ from palpate.io.lineless_triggers import (
 from palpate.io.robot_link import LineSink, Port, SerialSink, StdoutPort, check_bits
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.runtime.loop import Answerer, Box
+from palpate.service.status_file import StatusFile
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.sweep_window import SweepCutter
 
@@ -224,3 +227,40 @@ def port(settings: Config, devices: Devices, *, terminal: bool = True) -> Port |
         return SerialSink(settings.serial, devices.clock)
     read = in_journal() or not (terminal or not sys.stdout.isatty())
     return None if read else StdoutPort()
+
+
+def capture(
+    path: Path | None, settings: Config, format: SweepFormat, stack: ExitStack
+) -> CaptureWriter | None:
+    """The capture of `--capture`, which `stack` closes."""
+    made = CaptureWriter(path, format, skins.profile(settings)) if path else None
+    if made:
+        stack.callback(made.close)
+    return made
+
+
+def done(
+    wanted: int | None, box: Box, devices: Devices, stopped: Callable[[], bool]
+) -> Callable[[], bool]:
+    """True after a signal, after `wanted` answers, and at the end of a script."""
+    most = float("inf") if wanted is None else wanted
+    return lambda: box.answered >= most or stopped() or devices.finished(box.answered)
+
+
+def reports(
+    settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
+) -> list[Observer]:
+    """The writer of the status file and the server of the feed, if the settings name them. The
+    default folder exists in a service only. model: facts about the bundle for the first line of
+    the feed."""
+    status, feed, made = settings.store.status, settings.store.feed, list[Observer]()
+    if status and os.access(status.parent, os.W_OK):
+        made.append(StatusFile(status, SystemClock(), facts))
+    default = settings.sources["store.runtime"] == "code"
+    if feed and (not default or os.access(feed.parent, os.W_OK)):
+        from palpate.service.feed import FeedServer
+
+        known = {"source": source, "skin": settings.skin.profile, **model}
+        known["unit"] = skins.profile(settings).unit
+        made.append(FeedServer(feed, format, known, SystemClock(), facts))
+    return made

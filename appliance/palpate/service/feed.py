@@ -234,7 +234,6 @@ class FeedServer(Observer):
                 reader.sweeps = request.sweeps
 
     def _send(self) -> None:
-        """Write to the readers that something waits for."""
         for reader in [reader for reader in self._readers.values() if reader.waits]:
             try:
                 reader.send()

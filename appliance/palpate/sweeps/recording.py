@@ -471,7 +471,6 @@ def _labels(about: Mapping[str, Any]) -> Labels:
 
 
 def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
-    """The message in the log for a changed outcome."""
     if outcome == "stored":
         return f"record: sweeps are stored again, from sweep {sweep} on"
     advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"

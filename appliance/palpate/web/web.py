@@ -1,13 +1,17 @@
 """`palpate watch --web`: reads the feed, and keeps the pages up to date: start, watch, align and
-history. They show a missing box as away until its feed is back."""
+history. They show a missing box as away until its feed is back, and list the other boxes of a site,
+which announce themselves on the network."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 
 from palpate.client.feed import Feed
-from palpate.core.errors import FormatError
+from palpate.core.clock import Clock
+from palpate.core.errors import ConfigError, FormatError
 from palpate.core.log import TroubleLog
+from palpate.service import network
 from palpate.web.access import Access
 from palpate.web.board import KEPT, PageBoard
 from palpate.web.history import History
@@ -18,6 +22,29 @@ FRAMES_HZ = 20.0
 READ_S = 0.5
 """Longest wait for a line of the feed. The page is updated as often while the box is away, so that
 browsers see that this program runs."""
+KEPT_NS = 60_000_000_000
+"""How long an answer of the network is kept."""
+
+
+class OtherBoxes:
+    """Lists the pages of other boxes, each with `name` and `address`; none without zeroconf."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._asked_ns, self._found = clock, -KEPT_NS, list[dict[str, str]]()
+
+    def __call__(self) -> list[dict[str, str]]:
+        """The list; it takes some seconds if the last one is too old."""
+        now_ns = self._clock.now_ns()
+        if now_ns - self._asked_ns < KEPT_NS:
+            return self._found
+        self._asked_ns, own, pages = now_ns, network.box_id(), {}
+        with suppress(ConfigError, OSError):
+            for one in reversed(network.found(self._clock)):  # the lowest port is the start's
+                if one.kind == "page" and not one.box.endswith(own):
+                    host = f"[{one.host}]" if ":" in one.host else one.host
+                    pages[one.box] = f"https://{host}:{one.port}/"
+        self._found = [{"name": box, "address": pages[box]} for box in sorted(pages)]
+        return self._found
 
 
 class PageWatcher:
@@ -54,7 +81,6 @@ class PageWatcher:
                 self.step()
 
     def step(self) -> None:
-        """Take the next line, or show that there is none."""
         if self.server.watched != self._frames:
             self._frames = not self._frames
             self.feed.ask(frames_hz=FRAMES_HZ if self._frames else 0)

@@ -24,7 +24,7 @@ from tests.factories.speaking_box import SpeakingBox, result, state
 from tests.robots.brokers import Mosquitto, Subscriber, TopicFlood, free_port, required
 
 mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
-broker = pytest.importorskip("palpate.bridges.mqtt_broker").broker
+broker = pytest.importorskip("palpate.bridges.mqtt").broker
 pytestmark = pytest.mark.usefixtures("hurried")
 
 

@@ -6,7 +6,7 @@ from palpate.core.errors import ConfigError
 from palpate.service import network
 from palpate.service.network import Reachable
 from palpate.sim.rig import VirtualClock
-from palpate.web.boxes import KEPT_NS, OtherBoxes
+from palpate.web.web import KEPT_NS, OtherBoxes
 
 
 def test_pages_of_other_boxes_are_listed_once_a_minute(monkeypatch):
