@@ -61,6 +61,21 @@ def test_distances_leave_out_what_the_copies_vary_in():
     )
 
 
+def test_the_turned_embedding_keeps_all_directions():
+    """Also those towards junk: a bundle holds a square matrix."""
+    x, labels, groups = sweeps(20, 0)
+    x = np.hstack([np.random.default_rng(2).standard_normal((len(x), 4)), x])
+    held, towards = groups >= 6, 9 * np.eye(8)[:2]
+    copied = AugmentedCopies(x, labels, np.arange(len(x)), held)
+    embedded = partial(embedding.embed, fixed=2, beyond=towards)
+    fit = fit_contact.fit(x, labels, groups, held, embedded, copied, 4 * np.eye(3)[labels[held]])
+    assert fit
+    displaced = fit.classes(embedded(x, labels).classes()).displaced
+    assert displaced
+    assert displaced.turn.shape == (6, 6)
+    assert displaced.means.shape == (3, 6)
+
+
 def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
     """Ten in a hundred at .62 ask for more; none for none; half, surely wrong, for too much."""
     _, fit, _ = made()

@@ -294,7 +294,8 @@ def fit(
         """An embedding of the sweeps `by` (bool [N]), and an embedding of the copies after the
         first."""
         z = embedded(whole[by], labels[by])
-        return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
+        kept = max(z.shapes.shape[1], len(z.offset) - len(z.means) + 1)  # no direction is lost
+        return z, embed(z(fitted.features), fitted.labels, kept)
 
     across, judge = turn(~held)
     novelty = judge.novelty(across(judging.features))
