@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.config import ClassifierConfig
-from palpate.core.status import Reason, Remark
+from palpate.core.status import LEAST_PROBABILITY, Reason, Remark
 from palpate.core.types import Status
 
 Array = NDArray[Any]
@@ -25,9 +25,6 @@ UNLIKE = 0.8
 0.7 % of known sweeps in ten sets, 1.2 % in one, and as many are answered. Of strangers after a
 known fabric without NEW OBJECT 16 and 19 % become surer than alone, in place of 24 and 30 %. With
 0.5 it is 13 and 14 %, and 1.3 points fewer are answered in one set."""
-LEAST_PROBABILITY = 1e-12
-"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
-all others."""
 
 
 def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from palpate.answer.disturbance import Disturbances
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
 from palpate.core.schema import Positive, Within, check
-from palpate.core.status import Reason, Remark
+from palpate.core.status import UNSURE, Reason, Remark
 from palpate.core.types import Status
 
 Array = NDArray[np.float64]
@@ -36,10 +36,6 @@ ALIKE = 0.5
 ones. Of pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 %
 (simulated skin, four pairs of materials left out). It does not tell two cottons of FabricSlide
 apart."""
-
-
-UNSURE = 0.5
-"""Least probability for status ok if the bundle does not set it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from palpate.core.errors import ApplianceError, ConfigError, LinkLost
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log, to_stderr
 from palpate.core.sentences import MOST_FINGERS, Sentence
+from palpate.core.status import UNSURE
 from palpate.core.text import printable
 from palpate.service import network
 
@@ -75,7 +76,7 @@ def feeds(given: Sequence[str]) -> dict[str, Feed]:
 
 
 def run_fuse(args: argparse.Namespace) -> int:
-    from palpate.bridges.fuse import UNSURE, FingerFusion, listen
+    from palpate.bridges.fuse import FingerFusion, listen
 
     settings, clock = config.load(None), SystemClock()
     each = feeds(args.fingers or settings.bridge.fingers.split())

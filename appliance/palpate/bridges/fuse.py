@@ -15,12 +15,8 @@ from palpate.core import sentences
 from palpate.core.clock import Clock
 from palpate.core.log import log
 from palpate.core.sentences import Sentence, sentence
-from palpate.core.status import Status
+from palpate.core.status import LEAST_PROBABILITY, Status
 
-LEAST_PROBABILITY = 1e-12
-"""Lower bound of probabilities in the product, as in the fusion of sweeps."""
-UNSURE = 0.5
-"""Least probability for status ok without a setting; also the threshold that export writes."""
 GRACE_NS = 250_000_000
 """How long a finger that does not sweep may answer after another; the feed may be 30 ms late."""
 STATE_NS = 1_000_000_000

@@ -7,18 +7,18 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from palpate.bridges.results import KEPT
 from palpate.client.feed import Feed
 from palpate.client.verdicts import VerdictFile, dated
 from palpate.core.clock import Clock
 from palpate.core.log import SparseLog
 
 READ_S = 0.5
-KEPT = 1000
-"""Verdicts that wait for a disk that is full or busy; then the oldest is lost."""
 
 
 class MemoryBridge:
-    """Takes the verdicts of `feed`, and writes them to `file`. clock: of the feed's time stamps."""
+    """Takes the verdicts of `feed`, and writes them to `file`; KEPT of them wait for a disk that is
+    full or busy. clock: of the feed's time stamps."""
 
     def __init__(self, feed: Feed, file: VerdictFile, clock: Clock) -> None:
         self._feed, self._file, self._clock = feed, file, clock

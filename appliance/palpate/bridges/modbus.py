@@ -20,7 +20,7 @@ from palpate.bridges.modbus_pdu import (
     RequestRefused,
     Writing,
 )
-from palpate.bridges.server import TcpPeer
+from palpate.bridges.server import PACE_S, TcpPeer
 from palpate.bridges.source import BoxView, Source
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError, FormatError
@@ -41,9 +41,6 @@ ORDER = ("ABORT", "NEW", "TARE", "START", "STOP")
 """Order in which the commands of one write are sent."""
 INPUTS = ("alive", "ready", "sweeping", "fault", "known", "early")
 LABEL_WORDS = 16
-PACE_S = 0.005
-"""Pause after each request of a connection, so that a flood of requests leaves the other programs
-of the computer their share."""
 REQUEST_S = 5.0
 """Longest time for the rest of a request, and for a peer to accept a reply."""
 

@@ -32,7 +32,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from palpate.bridges.mqtt_content import discovery, state, verdict
 from palpate.bridges.options import read_login
-from palpate.bridges.results import Results
+from palpate.bridges.results import KEPT, Results
 from palpate.bridges.source import COMMANDS, source_of
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
@@ -45,8 +45,6 @@ from palpate.core.retry import retried
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 MOST_BYTES = 1024
 """Largest packet that the broker may send: commands are short."""
-KEPT = 1000
-"""Verdicts that wait for the broker; then the oldest is dropped and counted."""
 HEADER, LARGEST = 16, 268_435_455
 """Most bytes of a message around topic and content, and of one for which a broker sets no limit."""
 FLYING = 16

@@ -32,7 +32,7 @@ from palpate.bridges.opcua_model import (
 from palpate.bridges.opcua_security import Login, limit, own_certificate
 from palpate.bridges.opcua_space import SmallServer
 from palpate.bridges.options import read_login
-from palpate.bridges.results import MOST, Results
+from palpate.bridges.results import KEPT, MOST, Results
 from palpate.bridges.server import CLOSE_S, not_listening
 from palpate.bridges.source import source_of
 from palpate.client.answers import Answer
@@ -44,8 +44,6 @@ from palpate.core.log import SparseLog
 
 URI = "urn:palpate:box"
 """Namespace of the nodes. A node's identifier is its path, the same on every box."""
-WAITING = 1000
-"""Results that wait to be written."""
 LOOK_S = 1.0
 """Longest time between two looks at the box."""
 
@@ -66,7 +64,7 @@ class OpcuaBridge:
         self._name, self._args, self._clock = name, args, clock
         self._log = SparseLog(clock.now_ns)
         self._loop = asyncio.get_running_loop()
-        self._news: deque[tuple[float, Answer]] = deque(maxlen=WAITING)
+        self._news: deque[tuple[float, Answer]] = deque(maxlen=KEPT)
         self._results = Results(args.memory)
         self._come, self._commanding = asyncio.Event(), asyncio.Lock()
         self._said: dict[str, tuple[Any, int]] = {}

@@ -24,20 +24,17 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from palpate.bridges.results import KEPT
+from palpate.bridges.server import PACE_S
 from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.errors import ConfigError
 from palpate.core.log import SparseLog
 from palpate.core.text import printable
 
-KEPT = 1000
-"""Values that wait for a subscriber."""
 MOST_MESSAGE, MOST_BYTES, MOST_WAITING = 1 << 20, 1 << 17, 64
 """Of a client: its longest message, the bytes of a part that is not complete, and the parts that
 wait. Each of them holds all bytes that came with it."""
-PACE_S = 0.005
-"""Pause after each piece that a client sends, so that a flood leaves the other programs of the
-computer their share."""
 FASTEST_MS = 10.0
 """Shortest publishing interval but 0, which publishes at once."""
 ACTIVATED_S = 5.0

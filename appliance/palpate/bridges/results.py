@@ -15,7 +15,7 @@ from palpate.core import wall_clock
 from palpate.core.errors import FeedError
 
 KEPT = 1000
-"""Results in memory."""
+"""Results that a bridge holds in memory; then the oldest is lost."""
 SAME_S = 5.0
 """The same sweep of two programs, by their clocks: a restart of the box takes longer."""
 MOST = 100

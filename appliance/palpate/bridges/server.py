@@ -20,6 +20,9 @@ QUIET_S = 5.0
 one."""
 BUFFER = 64 * 1024
 """Most bytes that wait for one peer; a peer that does not read them is dropped."""
+PACE_S = 0.005
+"""Pause after each request or piece that a client sends, so that a flood leaves the other programs
+of the computer their share."""
 CLOSE_S = 1.0
 """Longest wait until a peer has read the rest."""
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from palpate.answer import features
 from palpate.answer.rules import Rules
-from palpate.answer.unknown import UNSURE
 from palpate.answer.window import WindowLimits
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.names import LABEL, MOST_SHOWN, can_be_shown
 from palpate.core.schema import MOST, Within, check, typed
+from palpate.core.status import UNSURE
 from palpate.core.types import SweepFormat
 
 SCHEMA = 1

@@ -8,6 +8,12 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+UNSURE = 0.5
+"""Least probability for status ok where neither settings nor the bundle give one."""
+LEAST_PROBABILITY = 1e-12
+"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
+all others."""
+
 
 class Status(StrEnum):
     """The outcome of a sweep, in the order of the codes. PROTOCOL.md explains each."""

@@ -26,6 +26,7 @@ from palpate.core.observer import Health, Observer
 from palpate.core.schema import typed
 from palpate.core.statistics import wilson
 from palpate.core.types import Status, Sweep, Verdict
+from palpate.deployment.state import MOST_STARTS
 from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sweeps.sweep_folder import SweepFolder
 
@@ -40,11 +41,9 @@ wait for it."""
 MOST_MODELS = 20 << 20
 """Bytes that both models may have together. The paper's network in int8 has 16 MB, and needs 25 MB
 besides the 60 of the service, which may have 256 MB (systemd/palpate.service)."""
-STARTS = 3
-"""After this many starts in a row that did not last PERIOD_NS, the candidate is no longer
-loaded."""
 PERIOD_NS = 60_000_000_000
-"""Interval at which the counts are written while both bundles agree."""
+"""Interval at which the counts are written while both bundles agree. After MOST_STARTS starts in a
+row that did not last as long, the candidate is no longer loaded."""
 NEVER_NS = 1 << 63
 
 
@@ -245,7 +244,7 @@ class Shadow(Observer):
             for number in [*self._sweeps.numbers]:
                 self._sweeps.remove(number)
             found = Agreement(candidate, current)
-        if found.starts >= STARTS:
+        if found.starts >= MOST_STARTS:
             self._sweeps.close()
             raise ApplianceError(
                 f"the program has died {found.starts} times while candidate {candidate} ran next "

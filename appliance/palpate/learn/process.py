@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from palpate.client.feed import MOST_LINE
 from palpate.core.clock import Clock
 from palpate.core.config import TeachConfig
 from palpate.core.errors import ConfigError
@@ -28,8 +29,6 @@ ENDED_S = 5.0
 """Longest wait for a killed process."""
 QUIET_S = 300.0
 """Longest time without a line of news; the longest step takes far less."""
-MOST_LINE = 1 << 20
-"""Most bytes of an unfinished line."""
 
 FREE = "free some memory, teach fewer sweeps, or use a desktop"
 """The remedy where a process hangs: a library that gets no memory may ask for it for ever."""

@@ -81,7 +81,6 @@ COOKIE = "__Host-palpate"
 KEY = "X-Palpate-Key"
 """Header with the key of an order. The page gets the key with its events; another site cannot read
 it."""
-DAY = 86_400
 ENTRANCE = ("/enter.html", "/enter.js", "/old.js", "/page.css", "/logo.svg")
 """Files for a browser without a token; none of them is secret."""
 
@@ -339,7 +338,7 @@ class FileHandler(_Handler):
                 secure=True,
                 httponly=True,
                 samesite="Strict",
-                max_age=365 * DAY,
+                max_age=365 * 24 * 3600,
             )
             self.set_status(204)
             return

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer.objects import LEAST_PROBABILITY, FusedSweeps, contradicts, softmax
+from palpate.answer.objects import FusedSweeps, contradicts, softmax
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
+from palpate.core.status import LEAST_PROBABILITY
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin

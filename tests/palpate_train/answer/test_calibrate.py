@@ -8,7 +8,7 @@ import pytest
 
 from palpate.answer.early import Early
 from palpate.answer.objects import softmax
-from palpate.answer.unknown import UNSURE
+from palpate.core.status import UNSURE
 from palpate_train.answer.calibrate import Calibration, fit_calibration
 from palpate_train.answer.fit_contact import AugmentedCopies
 from palpate_train.answer.fit_early import EarlyRule

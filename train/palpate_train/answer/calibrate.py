@@ -18,13 +18,9 @@ from numpy.typing import NDArray
 
 from palpate.answer.contact import DisplacementRule
 from palpate.answer.early import Early
-from palpate.answer.objects import LEAST_PROBABILITY, softmax
-from palpate.answer.unknown import (
-    UNSURE,
-    Classes,
-    Known,
-    shaped_distances,
-)
+from palpate.answer.objects import softmax
+from palpate.answer.unknown import Classes, Known, shaped_distances
+from palpate.core.status import LEAST_PROBABILITY, UNSURE
 from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import fit_contact, fit_early
 from palpate_train.answer.embedding import (

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from palpate.answer.hum import MAINS_HZ
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, digitized
 from palpate.sim import skin
@@ -25,7 +26,7 @@ from palpate_train.data.augment import NOISY
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps, SimulatedScene
 
 Array = NDArray[Any]
-HUM_HZ = 50.0
+HUM_HZ = MAINS_HZ[0]
 GAIN_LAW = 0.25
 """Spread of the gains at the severest shift of the grid: their logarithms are drawn evenly within
 this range each way."""

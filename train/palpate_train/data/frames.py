@@ -22,7 +22,7 @@ from palpate_train.data.import_plan import DATE, ImportPlan
 RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""
-DAY_S = 86_400
+DAY_S = sampling.UNITS_S["d"]
 _NAMED = r"\d{1,2}\.?[- ][^\W\d_]{3,9}\.?[- ]\d{2,4}|[A-Za-z]{3,9} \d{1,2}(?:,? \d{4})?"
 MOMENT = re.compile(
     r"(?:(?:[A-Z][a-z]{1,8},? )?"

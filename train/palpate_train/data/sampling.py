@@ -13,9 +13,10 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
+from palpate.sweeps.frame_ring import MAX_GAP
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
-GAP_FRAMES = 3.5
+GAP_FRAMES = MAX_GAP + 1.5
 """An interval longer than this many frames is a gap: three or more frames are missing. The box
 counts gaps in the same way."""
 MOST_ROUNDING = 1.0

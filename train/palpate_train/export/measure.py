@@ -28,8 +28,6 @@ Call = Callable[[Array], Any]
 ROUNDS, BLOCK = 60, 6
 """Number of rounds, and of sweeps of a model in a round. One more sweep before them is not counted,
 because the model before it has emptied the caches."""
-TIMED_SWEEPS = 60
-"""Approximate number of different sweeps, spread evenly over the given sweeps."""
 SWEEPS_BEFORE_MEMORY = 20
 """Number of sweeps that a process answers before its memory is read."""
 MEMORY_S = 600
@@ -61,12 +59,13 @@ class Measurement:
 
 
 def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
-    """The Measurement of the model in each of `folders`, in their order; all are timed in turns.
+    """The Measurement of the model in each of `folders`, in their order; all are timed in turns,
+    with about ROUNDS different sweeps.
 
     sweeps: raw counts [n, T, R, C], in the format of all models. Raises BundleError if a model does
     not run.
     """
-    some = sweeps[:: max(len(sweeps) // TIMED_SWEEPS, 1)]
+    some = sweeps[:: max(len(sweeps) // ROUNDS, 1)]
     took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
     return [_measurement(folder, took[str(folder)], memory(folder, some)) for folder in folders]
 

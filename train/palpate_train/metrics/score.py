@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.core.provenance import commit
 from palpate.core.statistics import interval as interval
 from palpate.core.statistics import widen as widen
 from palpate.core.statistics import wilson
+from palpate.core.status import LEAST_PROBABILITY
 
 Array = NDArray[Any]
 REFUSED, UNKNOWN = -1, -2

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.objects import LEAST_PROBABILITY
+from palpate.core.status import LEAST_PROBABILITY
 
 Array = NDArray[Any]
 TEMPERATURES = np.geomspace(1, 100, 200)
@@ -38,8 +38,8 @@ seeds 301 to 316). With 1, heads judged by four positions stay overconfident."""
 SHY = 2.5
 """Standard errors by which the largest probabilities may on average be below the share of right
 labels."""
-LOG_TINY, MOST_LOSS = np.log(1e-12), -np.log(LEAST_PROBABILITY)
-"""Least logarithm of a probability, and largest loss: one absurd sweep does not decide."""
+MOST_LOSS = -np.log(LEAST_PROBABILITY)
+"""Largest loss of a sweep: one absurd sweep does not decide."""
 
 
 def platt_temperature(logits: Array, labels: Array) -> float:
@@ -63,7 +63,7 @@ def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> 
     wrong, log_p = 1 / (len(labels) + 2), _cooled(logits)
 
     def cost(log_temperature: float) -> float:
-        p = np.maximum(log_p(np.exp(log_temperature)), LOG_TINY)
+        p = np.maximum(log_p(np.exp(log_temperature)), -MOST_LOSS)
         right = p[labels, np.arange(len(labels))]
         return float(-weights @ ((1 - wrong) * right + wrong * p.mean(axis=0)))
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
+from palpate.core.statistics import DRAWS
 from palpate_train.data import sets
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
@@ -32,8 +33,6 @@ SIZES = (2, 4, 8, 16, 32, 64, 128, 256)
 left out."""
 SPLIT = "split:set=0->1"
 """Trains on the first of two joined sets and tests on the second."""
-DRAWS = 2000
-"""Draws for the interval of what twice as many sweeps would bring."""
 
 
 def run(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import sys
 from contextlib import suppress
@@ -19,8 +18,6 @@ from typing import Any
 
 from palpate.core.errors import ApplianceError
 
-NICE = 19
-"""Priority of the process: the lowest. The loop always comes first."""
 LEAST_MB = 256
 """Private memory that a small lesson needs; numpy and scipy take most of it. Where they get less, a
 BLAS may ask for memory for ever, so the limit is compared before they are loaded."""
@@ -113,9 +110,7 @@ def _limit_cpu(seconds: int) -> None:
 
 
 def _restrict(memory_mb: int) -> None:
-    """Take the lowest priority and the limit of memory; a system that forbids it has its own."""
-    with suppress(OSError):
-        os.nice(NICE)
+    """Take the limit of memory, and end first where memory is short."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

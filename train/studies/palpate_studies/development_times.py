@@ -70,7 +70,7 @@ def measured(
     entries: list[Json] = []
     calls: dict[str, measure.Call] = {}
     left_out: dict[str, str] = {}
-    some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
+    some = sweeps.samples[:: max(len(sweeps) // measure.ROUNDS, 1)]
     with tempfile.TemporaryDirectory() as work:
         progress = Progress(len(names), log)
         brief = replace(effort, share=min(SHARE, effort.share))

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
+from palpate.answer.objects import fuse, softmax
+from palpate.core.status import LEAST_PROBABILITY
 from palpate.core.sweep_set import Array
 from palpate_studies.study import StudyCase, StudyRun
 from palpate_train.data.sets import Dataset

@@ -15,7 +15,7 @@ from functools import partial
 from palpate.core.errors import FormatError
 
 SAMPLED = 200
-"""Number of lines that show the decorations of a text."""
+"""Number of lines at the start and at the end that show the decorations and layout of a text."""
 USUAL = 0.8
 """Share of the lines with digits that have a decoration, if it is removed."""
 _STAMP = r"(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d(?:[.,]\d+)?"

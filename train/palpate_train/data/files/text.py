@@ -19,6 +19,7 @@ import numpy as np
 from palpate.core.errors import FormatError
 from palpate_train.data.files import plain_lines
 from palpate_train.data.files.decimals import decimal_sign, is_number, plain
+from palpate_train.data.files.plain_lines import SAMPLED
 from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
 COMMENTS = ("#", "%", "//")
@@ -39,8 +40,6 @@ QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?:[kmuµn]?(?:s|sec|V|N|A|Pa|g|m|Hz)|%
 LEAST_COUNTED = 8
 """From more numbers 1, 2, 3 ..., or other even steps, a line is no frame, whatever the frames are
 like."""
-SAMPLED = 200
-"""Number of lines at the start and at the end that show the layout of a text."""
 CLEAR = 0.9
 """A sign separates the columns if the share of numbers between it is this part of the largest."""
 NO_NUMBERS = "holds no line of numbers"

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from palpate.answer import hum
+from palpate.answer.slide import PARTS
 from palpate.core.errors import FormatError
 
 LEAST_WINDOW = 16
 """Frames of the shortest window of a trunk."""
-PREFIXES = 10
+PREFIXES = PARTS
 """Number of prefixes of a window, after each of which the box may answer early: the first tenth,
 the first two tenths, and so on to the whole window."""
 FLOOR = 0.02
@@ -23,7 +25,7 @@ LATER = (5, 2)
 """Kernel and stride of the stages after the first."""
 SHORT_KERNEL = 4
 """The first kernel for a window that does not allow any stride."""
-MAINS_HZ = 50.0
+MAINS_HZ = hum.MAINS_HZ[0]
 """Frequency that is filtered out by default. A kernel of 32 frames at 750 Hz then removes 50 Hz
 completely, but passes three quarters of 60 Hz."""
 

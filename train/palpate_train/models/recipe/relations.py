@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from palpate.core.types import SweepFormat
 from palpate_train.models.recipe.architectures import PREFIXES
+from palpate_train.models.recipe.spectrum import QUIET
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.graph_builder import FLOAT, GraphBuilder
 
@@ -30,9 +31,6 @@ MOST_CHANNELS = 24
 """Larger skins are divided into cells, whose taxels are averaged: pairs grow with the square."""
 MOST_FRAMES = 750
 """Of longer windows every second frame is used, or fewer."""
-QUIET = 1e-4
-"""Added to a variance, so that a silent taxel stays finite; the variance of a texture is about
-1."""
 NEARLY_ONE = 0.99
 """Factor of a correlation before arctanh, so that equal taxels stay finite."""
 

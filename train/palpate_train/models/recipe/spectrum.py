@@ -26,8 +26,8 @@ BANDS = 24
 """Largest number of bands of a spectrum: their edges are evenly spaced on a logarithmic axis, at
 whole half bins."""
 QUIET = 1e-4
-"""Added to the power of a band before its logarithm, so that a silent skin stays finite; the power
-of a texture is about 1."""
+"""Added to the power of a band before its logarithm, and to a variance, so that a silent skin stays
+finite; those of a texture are about 1."""
 MIN_SEGMENT = 4
 """Number of frames of the shortest segment that has a spectrum."""
 

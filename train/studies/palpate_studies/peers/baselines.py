@@ -28,8 +28,8 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from palpate.answer.objects import LEAST_PROBABILITY
 from palpate.core.errors import FormatError
+from palpate.core.status import LEAST_PROBABILITY
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models.methods import Method
