@@ -18,7 +18,7 @@ from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.export import measure
-from palpate_train.export.measure import Measurement
+from palpate_train.export.measure import BundleCost
 from palpate_train.models.recipe import choice as head_choice
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
@@ -26,7 +26,6 @@ from palpate_train.models.recipe.recipe import Settings
 from palpate_train.selection import dial, reduction_curves
 from palpate_train.selection.dial import (
     Budget,
-    BundleCost,
     JudgedSize,
     Judgement,
     NothingFits,
@@ -112,14 +111,14 @@ def test_the_accuracy_to_expect_is_that_of_choices_that_did_not_see_the_part():
 
 def test_cost_and_error_are_those_of_the_scarcer_and_of_groups():
     """The larger share of time and bytes; one place has a larger error than all."""
-    small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
+    small, fast = BundleCost(0.4, 20, 60, 1), BundleCost(0.1, 40, 50, 1)
     for budget, dearer, cheaper in (
         (Budget(ms=1, kb=1000, slower=2), small, fast),
         (Budget(ms=100, kb=50), fast, small),
         (Budget(), fast, small),
     ):
-        assert cheaper.order(budget) < dearer.order(budget)
-    assert BundleCost(0.1, 20, 50).order(Budget()) < small.order(Budget())
+        assert budget.order(cheaper) < budget.order(dearer)
+    assert Budget().order(BundleCost(0.1, 20, 50, 1)) < Budget().order(small)
     assert Budget(ms=1, kb=1000, slower=2).used(small) == {"ms": 0.8, "kb": 0.02}
     assert Budget(ms=0.5, slower=2).over(small).endswith(": 0.8 ms of 0.5")
     assert not Budget(kb=20).over(small)
@@ -213,7 +212,7 @@ def costs(monkeypatch: pytest.MonkeyPatch) -> None:
     def fixed(
         fits: dict[str, Fit], sweeps: Dataset, log: object
     ) -> tuple[dict[str, BundleCost], dict[str, str]]:
-        return {n: BundleCost(0.1 * i, 10.0 * i, 50.0) for i, n in enumerate(fits, 1)}, {}
+        return {n: BundleCost(0.1 * i, 10.0 * i, 50.0, 1.0) for i, n in enumerate(fits, 1)}, {}
 
     monkeypatch.setattr(dial, "bundle_costs", fixed)
     at = np.arange(96)
@@ -270,7 +269,7 @@ def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, 
     """The curve of one kind for the size "pairs", and the change of the fit."""
     judged = dial.judge(sweeps, Run(1), CLOSED, ["pairs"])
     some = SizeWish(accuracy=wanted, sizes=("pairs",))
-    cost = {"pairs": BundleCost(0.1, 10, 50)}
+    cost = {"pairs": BundleCost(0.1, 10, 50, 1)}
     choice = dial.Selection(judged, some, ["pairs"], cost, {}, "pairs", cast(Any, None))
     (curve,), change = reduction_curves.curves(choice, [kind])
     return curve, change
@@ -345,7 +344,7 @@ def command(folder: Path, *more: str) -> list[str]:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bundles are packed and not timed."""
-    one = Measurement(0.5, 0.6, 9_000, 12_000, 50.0)
+    one = BundleCost(0.5, 12.0, 50.0, 0.6)
     monkeypatch.setattr(measure, "measure_all", lambda folders, sweeps: [one] * len(folders))
 
 

@@ -29,6 +29,7 @@ from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.evaluate import trivial
 from palpate_train.evaluate.evaluate import CACHE
 from palpate_train.evaluate.fold import fingerprint
+from palpate_train.export.measure import BundleCost
 from palpate_train.metrics import score
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
@@ -229,7 +230,7 @@ def _chosen(
     return replace(made, about=made.about | {"size": choice.chosen}), change
 
 
-def _described(made: Fit, cost: dial.BundleCost, budget: Budget, refused: str) -> Json:
+def _described(made: Fit, cost: BundleCost, budget: Budget, refused: str) -> Json:
     used = {k: round(v, 3) for k, v in budget.used(cost).items()}
     about = {"content": made.about["chosen"], "format": made.train.format.json(), "used": used}
     return about | asdict(cost) | {"refused_with_less": refused}

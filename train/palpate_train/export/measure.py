@@ -37,29 +37,23 @@ MODEL = "model.onnx"
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """The cost of a packed model on this machine.
+class BundleCost:
+    """The cost of a bundle on this machine.
 
-    ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks
-    and features, in one thread. model_bytes: of the model's file. bundle_bytes: of all files,
-    golden sweeps included. rss_mib: resident memory (VmRSS) in MiB of a separate process that has
-    loaded the model and answered SWEEPS_BEFORE_MEMORY sweeps.
+    ms, ms_p99: median and 99th percentile of the processor time in ms of one sweep through the
+    box's classifier, with its checks and features, in one thread. kb: size of all files in units of
+    1000 bytes, golden sweeps included. mb: resident memory (VmRSS) in MiB of a separate process
+    that has loaded the model and answered SWEEPS_BEFORE_MEMORY sweeps.
     """
 
-    ms_p50: float
+    ms: float
+    kb: float
+    mb: float
     ms_p99: float
-    model_bytes: int
-    bundle_bytes: int
-    rss_mib: float
-
-    @property
-    def bundle_kb(self) -> float:
-        """Size of all files in units of 1000 bytes."""
-        return round(self.bundle_bytes / 1000, 2)
 
 
-def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
-    """The Measurement of the model in each of `folders`, in their order; all are timed in turns,
+def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[BundleCost]:
+    """The cost of the bundle in each of `folders`, in their order; all are timed in turns,
     with about ROUNDS different sweeps.
 
     sweeps: raw counts [n, T, R, C], in the format of all models. Raises BundleError if a model does
@@ -67,12 +61,12 @@ def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) ->
     """
     some = sweeps[:: max(len(sweeps) // ROUNDS, 1)]
     took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
-    return [_measurement(folder, took[str(folder)], memory(folder, some)) for folder in folders]
+    return [_cost(folder, took[str(folder)], memory(folder, some)) for folder in folders]
 
 
-def _measurement(folder: Path, took_ms: Array, rss_mib: float) -> Measurement:
+def _cost(folder: Path, took_ms: Array, mb: float) -> BundleCost:
     p50, p99 = (round(float(np.percentile(took_ms, q)), 4) for q in (50, 99))
-    return Measurement(p50, p99, *sizes(folder), rss_mib)
+    return BundleCost(p50, round(sizes(folder)[1] / 1000, 2), mb, p99)
 
 
 def sizes(folder: Path) -> tuple[int, int]:

@@ -53,10 +53,10 @@ def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
         "materials": [material(name, found) for name in found.answered],
         "calibration": calibration(classifier, known),
         "cost": {
-            "ms": cost.ms_p50,
+            "ms": cost.ms,
             "ms_p99": cost.ms_p99,
-            "kb": cost.bundle_kb,
-            "mib": cost.rss_mib,
+            "kb": cost.kb,
+            "mib": cost.mb,
         },
         "corruptions": corruptions(classifier, EvaluationSweeps.of(known, seed=seed), log, seed),
     }

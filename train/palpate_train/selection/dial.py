@@ -25,7 +25,7 @@ from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import Change
 from palpate_train.export import measure, quantized_bundle
-from palpate_train.export.measure import Measurement
+from palpate_train.export.measure import BundleCost
 from palpate_train.metrics.score import confusion, interval, row_shares
 from palpate_train.models.methods import Log
 from palpate_train.models.recipe import recipe
@@ -69,11 +69,18 @@ class Budget:
         needs = {"ms": cost.ms * self.slower, "kb": cost.kb}
         return {k: v / limit for k, v in needs.items() if math.isfinite(limit := getattr(self, k))}
 
+    def order(self, cost: BundleCost) -> tuple[float, float]:
+        """The sort key of sizes: the larger of the used shares of the budget, or the bytes if it
+        has no limits; then the time."""
+        return max(self.used(cost).values(), default=cost.kb), cost.ms
+
     def over(self, cost: BundleCost) -> str:
         """Why a bundle exceeds the budget, or ""."""
-        needs = {"ms": cost.ms * self.slower, "kb": cost.kb}
-        used = self.used(cost)
-        over = [f"{needs[k]:.3g} {k} of {getattr(self, k):g}" for k in used if used[k] > 1]
+        over = [
+            f"{share * getattr(self, k):.3g} {k} of {getattr(self, k):g}"
+            for k, share in self.used(cost).items()
+            if share > 1
+        ]
         return f"over the budget: {', '.join(over)}" if over else ""
 
 
@@ -84,26 +91,6 @@ class SizeWish:
     budget: Budget = Budget()
     accuracy: float = 0.0
     sizes: tuple[str, ...] = tuple(FAMILY)
-
-
-@dataclass(frozen=True)
-class BundleCost:
-    """The cost of a bundle on this machine. ms: median processor time of a sweep. kb: size of the
-    whole bundle in units of 1000 bytes. mb: resident memory in MiB."""
-
-    ms: float
-    kb: float
-    mb: float
-
-    @classmethod
-    def of(cls, measurement: Measurement) -> BundleCost:
-        """The three figures of a measurement."""
-        return cls(measurement.ms_p50, measurement.bundle_kb, measurement.rss_mib)
-
-    def order(self, budget: Budget) -> tuple[float, float]:
-        """The sort key of sizes: the larger of the used shares of the budget, or the bytes if it
-        has no limits; then the time."""
-        return max(budget.used(self).values(), default=self.kb), self.ms
 
 
 @dataclass(frozen=True)
@@ -385,7 +372,7 @@ def choose(sweeps: Dataset, run: Run, settings: Settings, wanted: SizeWish) -> S
     over = {name: why for name, cost in costs.items() if (why := wanted.budget.over(cost))}
     why_not = judged.refused | refused | over
     within = [name for name in costs if name not in over]
-    order = sorted(within, key=lambda name: costs[name].order(wanted.budget))
+    order = sorted(within, key=lambda name: wanted.budget.order(costs[name]))
     if not order:
         raise NothingFits(_nearest(costs, why_not, wanted.budget))
     chosen = judged.choose(order, wanted.accuracy, np.ones(len(judged.labels), bool))
@@ -423,14 +410,14 @@ def bundle_costs(
                 folders[name] = folder
         log(f"{len(folders)} bundles take turns")
         found = measure.measure_all(list(folders.values()), sweeps.samples) if folders else []
-    return {name: BundleCost.of(one) for name, one in zip(folders, found, strict=True)}, refused
+    return dict(zip(folders, found, strict=True)), refused
 
 
 def _nearest(costs: Mapping[str, BundleCost], why_not: Mapping[str, str], budget: Budget) -> str:
     """The reason why no size can be used; it gives the size that exceeds the budget least."""
     if not costs:
         return "; ".join(f"{name} cannot be used here: {why}" for name, why in why_not.items())
-    name = min(costs, key=lambda name: costs[name].order(budget))
+    name = min(costs, key=lambda name: budget.order(costs[name]))
     return (
         f"no model fits the board; the nearest is {name}, {why_not[name]}: "
         "raise the budget, or record shorter sweeps"
