@@ -77,20 +77,9 @@ class ContactLimit:
         return tuple(self.tare.ravel().tolist()) if self.tare.any() else ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ContactCentres:
-    """Centres of contact in training, in taxels. centres: [P, 2], row and column. limit: distance
-    from the nearest centre up to which a contact is in place."""
-
-    centres: Array
-    limit: float
-
-    def in_mm(self, pitch_mm: float) -> ContactPositions:
-        """The same for a skin with this distance between taxels, as a bundle holds it."""
-        rows, cols = (self.centres * pitch_mm).round(3).T.tolist()
-        return ContactPositions(
-            float(pitch_mm), tuple(rows), tuple(cols), round(pitch_mm * self.limit, 3)
-        )
+Centres = tuple[Array, float]
+"""Centres of contact in training, in taxels [P, 2], row and column; and the distance from the
+nearest centre up to which a contact is in place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +88,7 @@ class Contacts:
     pitch_mm: of a simulated skin, whose pitch is known; else None."""
 
     limit: ContactLimit
-    centres: ContactCentres | None
+    centres: Centres | None
     pitch_mm: float | None
 
     @classmethod
@@ -111,20 +100,22 @@ class Contacts:
     def positions(self, pitch_mm: float | None) -> ContactPositions | None:
         """The contact positions in mm; None if the pitch or the centres are unknown."""
         pitch_mm = self.pitch_mm if pitch_mm is None else pitch_mm
-        return self.centres.in_mm(pitch_mm) if self.centres and pitch_mm is not None else None
+        if self.centres is None or pitch_mm is None:
+            return None
+        rows, cols = (self.centres[0] * pitch_mm).round(3).T.tolist()
+        limit_mm = round(pitch_mm * self.centres[1], 3)
+        return ContactPositions(float(pitch_mm), tuple(rows), tuple(cols), limit_mm)
 
     def arrays(self) -> dict[str, Array]:
         """The arrays that the file of a fit keeps."""
-        return {"tare": self.limit.tare} | (
-            {"centres": self.centres.centres} if self.centres else {}
-        )
+        return {"tare": self.limit.tare} | ({"centres": self.centres[0]} if self.centres else {})
 
     def figures(self) -> dict[str, Any]:
         """The numbers that the file of a fit keeps, for JSON."""
         return {
             "contact": self.limit.contact,
             "why": self.limit.why,
-            "limit": self.centres.limit if self.centres else None,
+            "limit": self.centres[1] if self.centres else None,
             "pitch_mm": self.pitch_mm,
         }
 
@@ -132,9 +123,8 @@ class Contacts:
     def read(cls, arrays: Mapping[str, Array], figures: dict[str, Any]) -> Contacts:
         """The Contacts that gave `arrays` and `figures`."""
         limit = ContactLimit(figures["contact"], arrays["tare"], figures["why"])
-        centres = None
-        if figures["limit"] is not None:
-            centres = ContactCentres(arrays["centres"], figures["limit"])
+        reach = figures["limit"]
+        centres = None if reach is None else (arrays["centres"], reach)
         return cls(limit, centres, figures["pitch_mm"])
 
 
@@ -195,7 +185,7 @@ def _limit_of_raw_counts(means: Array) -> ContactLimit:
     return ContactLimit(SHARE * weakest, tare)
 
 
-def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
+def find_centres(sweeps: Dataset, limit: ContactLimit) -> Centres | None:
     """The centre of contact at each position of `sweeps`, or in each recording if positions are
     unknown; None without a limit or a contact. Loads are computed as on a box that was not tared.
 
@@ -213,8 +203,7 @@ def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
     member = np.unique(position, return_inverse=True)[1]
     centres = np.stack([points[member == p].mean(axis=0) for p in range(member.max() + 1)])
     reach = embedding.limit(farthest(points, member, centres)) if len(centres) > 1 else 0.0
-    some = evenly(len(centres), MOST_POSITIONS)
-    return ContactCentres(centres[some], max(MIN_LIMIT, reach))
+    return centres[evenly(len(centres), MOST_POSITIONS)], max(MIN_LIMIT, reach)
 
 
 def farthest(points: Array, member: Array, centres: Array) -> Array:

@@ -15,6 +15,7 @@ from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.rule import Rule
 from palpate_train.data.sets import Dataset
+from palpate_train.data.thinning import evenly
 from palpate_train.metrics.tolerances import MARGIN, OUTER
 
 MOST_SWEEPS = 1000
@@ -31,9 +32,7 @@ UNNOTICED = "a finger that rests: not noticed"
 
 def slides(meter: SlideMeter, sweeps: Dataset) -> list[Slide]:
     """The slides of at most MOST_SWEEPS of the sweeps."""
-    count = min(len(sweeps), MOST_SWEEPS)
-    chosen = np.linspace(0, len(sweeps) - 1, count).round().astype(int)
-    return [meter(window) for window in sweeps.samples[chosen]]
+    return [meter(window) for window in sweeps.samples[evenly(len(sweeps), MOST_SWEEPS)]]
 
 
 def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange | None, str]:

@@ -104,8 +104,7 @@ class Result:
     def _counts(self, logits: Array) -> dict[str, Any]:
         """Right answers by window, and by recording if the set has recordings."""
         labels, recording = self.sweeps.labels[self.test], self.sweeps.group("recording")[self.test]
-        clusters = Protocol(self.protocol).clusters(self.sweeps)
-        clusters = None if clusters is None else clusters[self.test]
+        clusters = self._clusters(self.test)
         right = logits.argmax(1) == labels
         counts: dict[str, Any] = {
             "window": score_entry(right),
@@ -133,12 +132,16 @@ class Result:
                 np.concatenate([getattr(fold, name) for fold in packed])
                 for name in ("test", "box", "sure")
             )
-            clusters = Protocol(self.protocol).clusters(self.sweeps)
             became = outcomes(labels, sure, self.sweeps.labels[test])
             right = became.pop("right")
             box |= score_entry(right) | {name: int(of.sum()) for name, of in became.items()}
-            box["interval"] = interval(right, None if clusters is None else clusters[test])
+            box["interval"] = interval(right, self._clusters(test))
         return box
+
+    def _clusters(self, test: Array) -> Array | None:
+        """The groups of the sweeps `test` for intervals; None if each sweep is its own."""
+        clusters = Protocol(self.protocol).clusters(self.sweeps)
+        return None if clusters is None else clusters[test]
 
     def each_fold(self) -> list[dict[str, Any]]:
         """Each fold for scripts: the values that it leaves out, and every sweep's answers."""
@@ -175,15 +178,9 @@ class Result:
         """
         logits = np.concatenate([fold.forms[name] for fold in self.folds])
         precise, int8 = (logits, self.logits) if name == "float" else (self.logits, logits)
-        labels, clusters = (
-            self.sweeps.labels[self.test],
-            Protocol(self.protocol).clusters(self.sweeps),
-        )
-        lost = parity.loss(
-            precise.argmax(1) == labels,
-            int8.argmax(1) == labels,
-            None if clusters is None else clusters[self.test],
-        )
+        labels = self.sweeps.labels[self.test]
+        right = precise.argmax(1) == labels, int8.argmax(1) == labels
+        lost = parity.loss(*right, self._clusters(self.test))
         figures = asdict(parity.compare(precise, int8)) | asdict(lost)
         return self._counts(logits) | {key: round(value, 4) for key, value in figures.items()}
 
