@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate_train.data.sets import Dataset
-from palpate_train.data.thinning import thinned
+from palpate_train.data.sets import Dataset, thinned
 from tests.factories.sweep_sets import easy
 
 

@@ -20,7 +20,7 @@ from palpate.answer.unknown import Classes, shaped_distances
 from palpate.core.errors import FormatError
 from palpate_train.answer.heads import shrinkage
 from palpate_train.metrics import tolerances
-from palpate_train.onnx_tools.quantize import sixteen_bits
+from palpate_train.onnx_tools.graph_builder import sixteen_bits
 
 Array = NDArray[Any]
 PARTS = 10

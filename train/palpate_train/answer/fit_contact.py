@@ -37,8 +37,7 @@ from palpate_train.answer import embedding
 from palpate_train.answer.embedding import Embedding, embed, limit
 from palpate_train.answer.rule import Rule
 from palpate_train.data.augment import Augmentation, augment
-from palpate_train.data.sets import Dataset
-from palpate_train.data.thinning import evenly
+from palpate_train.data.sets import Dataset, evenly
 from palpate_train.metrics import tolerances
 from palpate_train.metrics.temperature import sufficient_temperature
 

@@ -14,8 +14,7 @@ from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.rule import Rule
-from palpate_train.data.sets import Dataset
-from palpate_train.data.thinning import evenly
+from palpate_train.data.sets import Dataset, evenly
 from palpate_train.metrics.tolerances import MARGIN, OUTER
 
 MOST_SWEEPS = 1000

@@ -29,7 +29,7 @@ from palpate_train.answer.embedding import (
     within,
 )
 from palpate_train.answer.rule import Rule
-from palpate_train.data.thinning import evenly
+from palpate_train.data.sets import evenly
 from palpate_train.metrics.tolerances import LEFT_OUT
 
 Array = NDArray[Any]

@@ -22,7 +22,7 @@ from palpate.answer.unknown import Known, shaped_distances
 from palpate.core.errors import FormatError
 from palpate.core.statistics import interval
 from palpate.sweeps.sweep_folder import NOT_THIS
-from palpate_train.data.thinning import evenly
+from palpate_train.data.sets import evenly
 from palpate_train.metrics.tolerances import KEPT, LEFT_OUT
 
 Array = NDArray[Any]

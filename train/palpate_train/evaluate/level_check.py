@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate_train.answer.heads import fit_discriminant
-from palpate_train.data.sets import Dataset
+from palpate_train.data.sets import Dataset, evenly
 from palpate_train.data.splitters import InnerPart, Protocol, draw, inner_parts
-from palpate_train.data.thinning import evenly
 from palpate_train.evaluate.trivial import scaled
 from palpate_train.metrics.score import interval
 

@@ -18,8 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from palpate_train.answer.calibrate import Calibration
 from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_early import STEPS, Heads
-from palpate_train.onnx_tools.graph_builder import joined
-from palpate_train.onnx_tools.quantize import sixteen_bits
+from palpate_train.onnx_tools.graph_builder import joined, sixteen_bits
 
 Array = NDArray[Any]
 Add = Callable[..., str]
@@ -90,8 +89,8 @@ def _embedded(add: Add, embedding: Embedding, x: str, axis: int, output: str) ->
 
 
 def _sixteen_bits(add: Add, matrix: Array, name: str) -> str:
-    """A matrix [F, n] or [D, F, n] in 16 bits (see quantize.sixteen_bits), which halves the largest
-    parts of a bundle. onnxruntime converts it to floats once, when it opens the model."""
+    """A matrix [F, n] or [D, F, n] in 16 bits (graph_builder.sixteen_bits), which halves the
+    largest parts of a bundle. onnxruntime converts it to floats once, when it opens the model."""
     whole, steps = sixteen_bits(matrix)
     floats = add("Cast", whole, output=f"{name}.whole", to=TensorProto.FLOAT)
     return add("Mul", floats, steps, output=name)

@@ -20,15 +20,6 @@ PERCENTILE = 99.9
 sweep would take resolution from all others."""
 
 
-def sixteen_bits(matrix: Array) -> tuple[Array, Array]:
-    """(int16 [F, ...], steps float32 [...]) of a matrix [F, ...]; a step is shared along the first
-    axis. Their product is the matrix, rounded."""
-    steps = np.maximum(
-        np.abs(matrix).max(axis=0) / np.iinfo(np.int16).max, np.finfo(np.float32).tiny
-    ).astype(np.float32)
-    return np.rint(matrix / steps).astype(np.int16), steps
-
-
 def quantize(
     model: onnx.ModelProto, sweeps: Array, ops: Sequence[str] = ("Conv", "Relu")
 ) -> onnx.ModelProto:

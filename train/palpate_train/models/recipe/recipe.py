@@ -39,9 +39,8 @@ from palpate_train.data.augment import (
 )
 from palpate_train.data.progress import StageLine
 from palpate_train.data.run import Log, Run
-from palpate_train.data.sets import Dataset
+from palpate_train.data.sets import Dataset, thinned
 from palpate_train.data.splitters import WEIGHT, InnerPart, inner_parts
-from palpate_train.data.thinning import thinned
 from palpate_train.metrics.score import interval
 from palpate_train.models.linear_head import hold_out_or_all
 from palpate_train.models.methods import AS_RECORDED, SkinUse
@@ -93,7 +92,7 @@ class Settings:
     calibration and contacts, which a bundle needs and `evaluate` does not. displaced: whether
     displaced contacts are calibrated; they need the distance between taxels. varies: the groups
     that will have other values in service; without any, all that can be left out. most: largest
-    number of sweeps that are used; of more, some are drawn, see thinning.thinned.
+    number of sweeps that are used; of more, some are drawn, see sets.thinned.
     """
 
     steps: int = 0
