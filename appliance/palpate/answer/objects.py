@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -98,16 +98,6 @@ class Evidence:
         # max() keeps the first of equals; argmax must agree
         votes[max(order, key=lambda k: votes[k])] += 1e-9
         return cls(sweeps, votes, sums, order)
-
-
-def fuse(scores: Iterable[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
-    """Fuse the probabilities float64 [K] of several sweeps of one object, at least one, into one
-    array [K]. fusion: as for `Evidence.of`."""
-    evidence = None
-    for own in scores:
-        evidence = Evidence.of(own, fusion, evidence)
-    assert evidence
-    return evidence.probabilities
 
 
 @dataclass(frozen=True, slots=True, eq=False)

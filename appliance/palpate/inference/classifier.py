@@ -172,10 +172,6 @@ class Classifier(Observer):
         m = self.bundle.manifest
         return self.model_runner(names, graph_input(m.input, taxels, m.format.rate_hz))
 
-    def prepare(self, *outputs: str) -> None:
-        """Open the session of these outputs now, so that the first sweep does not wait for it."""
-        self.model_runner.prepare(*outputs)
-
     def test(self) -> str:
         """The result of `self_test` in words."""
         return f"{len(self.bundle.golden)} golden sweeps differ by {self.self_test():.2g}"
@@ -356,7 +352,7 @@ class EarlyExit:
             limits = tuple(growth * limit for limit in limits)
         distances = EarlyDistances(classes.early, limits) if classes and classes.early else None
         outputs = ("early", *("early_embedding",) * (distances is not None))
-        classifier.prepare(*outputs)
+        classifier.model_runner.prepare(*outputs)  # now, so that the first sweep does not wait
 
         def network(taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
             return classifier.outputs(taxels, *outputs)

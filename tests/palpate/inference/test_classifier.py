@@ -17,7 +17,7 @@ import pytest
 
 from palpate.answer import features, slide
 from palpate.answer.early import Early
-from palpate.answer.objects import fuse, softmax
+from palpate.answer.objects import Evidence, softmax
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import UNTIL_NEW_OBJECT
@@ -86,6 +86,15 @@ def test_an_unknown_golden_sweep_is_none_that_came_before(default_bundle):
 def toy_folder(tmp_path: Path) -> Path:
     """The folder of a toy bundle, to be damaged."""
     return toy_bundle.put(tmp_path / "spoiled", toy_bundle.files())
+
+
+def fuse(scores, fusion):
+    """The probabilities of sweeps of one object, one after the other."""
+    first, *others = scores
+    evidence = Evidence.of(first, fusion)
+    for own in others:
+        evidence = Evidence.of(own, fusion, evidence)
+    return evidence.probabilities
 
 
 def test_fusion_is_the_papers_and_bayes():

@@ -169,7 +169,9 @@ def made():
     files = {bundle.MODEL: model.SerializeToString(), bundle.MEANS: means_file(done.classes())}
     named = "toy", "1", FORMAT, "raw", ("a", "b", "c"), Thresholds(1.0, 32767.0)
     entries = {k: bundle.file_entry(v) for k, v in files.items()}
-    manifest = Manifest(*named, entries, early=done.rule.early, known=done.known())
+    manifest = Manifest(
+        *named, entries, early=done.rule.early, known=done.limits.known(done.class_mean_temperature)
+    )
     golden = counts[:2], run(model, counts[:2])
     whole = bundle.Bundle(manifest, "0", files[bundle.MODEL], *golden, done.embedding.classes())
     return done, x, counts, labels, whole

@@ -61,7 +61,7 @@ def test_few_sweeps_search_few_places(tmp_path: Path):
     """No more taxels than sweeps are tried, but as many as may be broken."""
     test = EvaluationSweeps.of(windows("a", "b"), 2, 0)
     rule = fit_taxels.learned(test.sweeps)
-    bench = fit_taxels._Bench.of(bundle.load(toy(tmp_path)), rule, test, test, 0)
+    bench = fit_taxels._Bench(bundle.load(toy(tmp_path)), rule, test, test, 0)
     assert len(bench.places()) == fit_taxels.MOST
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from palpate.answer.contact import DisplacementRule
 from palpate.answer.early import Early
 from palpate.answer.objects import softmax
-from palpate.answer.unknown import Classes, Known, shaped_distances
+from palpate.answer.unknown import Classes, shaped_distances
 from palpate.core.status import LEAST_PROBABILITY, UNSURE
 from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import fit_contact, fit_early
@@ -119,14 +119,6 @@ class Calibration:
         each of them."""
         steps = self.steps.logits(self.embedding(prefixes))
         return softmax(np.concatenate([steps, self.logits(prefixes[:, -1])[:, None]], axis=1))
-
-    def known(self) -> Known:
-        """The entry `known` of a manifest."""
-        return self.limits.known(self.class_mean_temperature)
-
-    def displacement_rule(self) -> DisplacementRule | None:
-        """The entry `displacement` of a manifest."""
-        return self.displacement.rule if self.displacement else None
 
     def classes(self) -> Classes:
         """The means and shapes of the materials, and of displaced contacts, as a bundle holds

@@ -91,12 +91,6 @@ class Embedding:
         z: Array = np.asarray(features, np.float64) @ self.projection + self.offset
         return z
 
-    def distances(self, z: Array) -> Array:
-        """Squared distances [..., K] of z [..., r] to the means."""
-        away = z[..., None, :] - self.means.astype(np.float64)
-        squares: Array = np.einsum("...kr,...kr->...k", away, away)
-        return squares
-
     def classes(self) -> Classes:
         """The means as a bundle holds them; each counts as trained."""
         bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
@@ -115,11 +109,11 @@ class Embedding:
         nearest: Array = shaped_distances(away, self.shapes.astype(np.float64)).min(axis=-1)
         return nearest
 
-    def logits(self, features: Array, temperature: float = 1.0) -> Array:
+    def logits(self, features: Array) -> Array:
         """Features [..., F] -> logits [..., K] of LDA with equal priors, up to a term that all
         labels share."""
         means = self.means.astype(np.float64)
-        logits: Array = (self(features) @ means.T - (means**2).sum(1) / 2) / temperature
+        logits: Array = self(features) @ means.T - (means**2).sum(1) / 2
         return logits
 
 

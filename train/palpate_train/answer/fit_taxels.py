@@ -113,7 +113,7 @@ def _better(
     """With `loads` where the worst single taxel then leaves the true material more probable than
     with neighbours, by GAIN; else without."""
     sample = EvaluationSweeps.of(test.sweeps, _searched(SEARCHED, test), seed)
-    near = _Bench.of(bundle, rule, test, sample, seed)
+    near = _Bench(bundle, rule, test, sample, seed)
     if loads is None:
         return near
     told = near.by(replace(rule, loads=loads))
@@ -167,41 +167,34 @@ def learned(sound: Dataset) -> Bridging:
 
 
 class _Bench:
-    """Breaks taxels of test sweeps and counts the answers of the box.
+    """Breaks taxels of test sweeps and counts the answers of the box, which bridges by `rule` and
+    accepts all counts at full scale. It measures no disturbances, which would take a quarter of the
+    time: the sweeps have none but the faults.
 
     clean: [right, wrong] of the sound sweeps. sample: the sweeps that search worst places.
     """
 
     def __init__(
-        self, box: Classifier, test: EvaluationSweeps, sample: EvaluationSweeps, seed: int
-    ) -> None:
-        self._box, self._test, self._sample, self._seed = box, test, sample, seed
-        self._counted = dict[tuple[int, str, bytes], list[Any]]()
-        self.signal = test.deviation.reshape(*test.deviation.shape[:2], -1).sum(axis=2)
-
-    @classmethod
-    def of(
-        cls,
+        self,
         bundle: Bundle,
         rule: Bridging,
         test: EvaluationSweeps,
         sample: EvaluationSweeps,
         seed: int,
         model: ModelRunner | None = None,
-    ) -> _Bench:
-        """With the box that bridges by `rule` and accepts all counts at full scale. It measures no
-        disturbances, which would take a quarter of the time: the sweeps have none but the
-        faults."""
+    ) -> None:
         limits = replace(bundle.manifest.thresholds, saturated=1.0)
         manifest = replace(bundle.manifest, bridging=rule, thresholds=limits, disturbances=None)
         bundle = replace(bundle, manifest=manifest)
-        box = Classifier(bundle, SystemClock(), slides=False, model=model)
-        return cls(box, test, sample, seed)
+        self._box = Classifier(bundle, SystemClock(), slides=False, model=model)
+        self._test, self._sample, self._seed = test, sample, seed
+        self._counted = dict[tuple[int, str, bytes], list[Any]]()
+        self.signal = test.deviation.reshape(*test.deviation.shape[:2], -1).sum(axis=2)
 
     def by(self, rule: Bridging) -> _Bench:
         """The same with another rule."""
         given = self._test, self._sample, self._seed, self._box.model_runner
-        return _Bench.of(self._box.bundle, rule, *given)
+        return _Bench(self._box.bundle, rule, *given)
 
     @property
     def loads(self) -> LoadModes | None:

@@ -78,7 +78,7 @@ def from_features(
         unseen=replace(content, model=bundle_graph(apart, trunk), classes=classes[0]),
         model=bundle_graph(calibration, trunk, prefixes),
         early=rule.early,
-        displacement=calibration.displacement_rule(),
+        displacement=displaced.rule if (displaced := calibration.displacement) else None,
         classes=classes[1],
         about=content.about | {"early": early},
         figures=content.figures | figures,

@@ -115,14 +115,16 @@ def _manifest(
     """The manifest without figures, with the rules from features. named: name, version and
     commit."""
     name, version, commit = named
+    train = content.train
+    top = highest_count(train) if full_scale is None else float(full_scale)
     return bundle.Manifest(
         name=name,
         version=version,
         format=content.train.format,
         input=content.input,
         labels=content.train.materials,
-        displays=displays(content.train),
-        thresholds=thresholds(content.train, full_scale),
+        displays={name: text for name, text in train.displays.items() if name in train.materials},
+        thresholds=bundle.Thresholds(contact=None, full_scale=top),
         runtime=RUNTIME,
         early=content.early,
         known=content.known,
@@ -130,11 +132,6 @@ def _manifest(
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit),
     )
-
-
-def displays(sweeps: Dataset) -> dict[str, str]:
-    """The display names for a manifest, which has none for materials that are not there."""
-    return {name: text for name, text in sweeps.displays.items() if name in sweeps.materials}
 
 
 def _made(content: Content, commit: str) -> dict[str, Any]:
@@ -155,13 +152,6 @@ def _made(content: Content, commit: str) -> dict[str, Any]:
 def pack_to_measure(content: Content, target: Path) -> bundle.Manifest:
     """Pack `content` under the name of its method, only to measure its cost."""
     return pack(content, target, content.about["method"], "1", provenance.commit(), proven=False)
-
-
-def thresholds(sweeps: Dataset, full_scale: float | None) -> bundle.Thresholds:
-    """The thresholds for a window; without `full_scale` the highest count of the type is the full
-    scale."""
-    top = highest_count(sweeps) if full_scale is None else float(full_scale)
-    return bundle.Thresholds(contact=None, full_scale=top)
 
 
 def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.answer.objects import fuse, softmax
+from palpate.answer.objects import Evidence, softmax
 from palpate.core.status import LEAST_PROBABILITY
 from palpate.core.sweep_set import Array
 from palpate_studies.study import StudyCase, StudyRun
@@ -271,8 +271,13 @@ def _fused(outcome: Outcome, n: int, rule: str) -> Array:
     """bool [n], whether the first `n` sweeps of each exploration give the right material."""
     scores = softmax(outcome.logits)
     drawn = outcome.explorations[:, :n]
-    named = np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn])
-    return np.asarray(named == outcome.labels)
+    named = []
+    for row in drawn:
+        evidence = Evidence.of(scores[row[0]], rule)
+        for i in row[1:]:
+            evidence = Evidence.of(scores[i], rule, evidence)
+        named.append(evidence.probabilities.argmax())
+    return np.asarray(np.array(named) == outcome.labels)
 
 
 def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
