@@ -10,6 +10,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
+from mmap import MADV_DONTNEED
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,6 @@ from palpate.core.types import native
 
 MOST_S = 3.0
 """Longest processor time for a sweep. The service's watchdog waits 10 s for the loop."""
-MADV_DONTNEED = 4
-"""From <sys/mman.h>; the same on all architectures."""
 MAPS = Path("/proc/self/smaps")
 MAPPED = re.compile(r"(?m)^(\w+)-(\w+) r-[x-]p .* (/.*)\n(?:\w+:.*\n)*?Anonymous: *(\d+)")
 """Start, end, file and written KiB of a part of a file in memory that is not writable."""

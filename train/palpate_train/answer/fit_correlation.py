@@ -15,11 +15,11 @@ import numpy as np
 from palpate.answer.correlation import Correlations, correlations
 from palpate.bundle.contents import Bundle
 from palpate_train.answer.rule import Rule
-from palpate_train.data.junk import windows
+from palpate_train.data.junk import FOR_LIMITS, windows
 from palpate_train.data.sets import Dataset
 
-EACH, CAUGHT = 24, 0.95
-"""Windows of noise of each kind, and the share of them below the limit."""
+CAUGHT = 0.95
+"""Share of the windows of noise of each kind below the limit."""
 KINDS = ("stops halfway", "random phases")
 """Of palpate_train.data.junk: without correlation from frame to frame, and from taxel to taxel."""
 
@@ -30,7 +30,7 @@ def limits(train: Dataset, held_out: Dataset, seed: int = 0) -> Correlations:
     slides, judges = (np.array([correlations(x) for x in of.samples]) for of in (train, held_out))
     found = []
     for number, kind in enumerate(KINDS):
-        noise = windows(kind, train, EACH, np.zeros(train.samples.shape[2:]), seed)
+        noise = windows(kind, train, FOR_LIMITS, np.zeros(train.samples.shape[2:]), seed)
         middle, high = np.quantile([correlations(x)[number] for x in noise], (0.5, CAUGHT))
         least = min(np.sort(slides[:, number])[:2][-1], judges[:, number].min())
         limit = min(high, least)

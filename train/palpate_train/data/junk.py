@@ -21,6 +21,8 @@ from palpate_train.data.sets import Dataset
 
 Array = NDArray[Any]
 TAPS_HZ = 5.0
+FOR_LIMITS = 24
+"""Windows of each kind by which limits are found."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,6 @@ from palpate_train.evaluate.trivial import scaled
 from palpate_train.metrics.score import interval
 
 Array = NDArray[Any]
-FAR = 0.5
-"""An accuracy is far above chance if its 95 % interval begins above this share of the way from
-chance to 1: at six materials above 58 %, at two above 75 %."""
-LEFT = 0.5
-"""The interval of the accuracy across values has to end below this share of the way from chance to
-the lower end of the accuracy within a value. Then most of the accuracy within a value is due to the
-group, and the accuracy across values is not far above chance."""
 MOST_SWEEPS = 2000
 MOST_TAXELS = 255
 """Largest number of means of a sweep that are used, all axes counted."""
@@ -104,7 +97,7 @@ def _alone(levels: Dataset) -> list[str]:
         _chance(levels.labels[tested], whole[tested]),
     )
     low, _ = interval(right, _clusters(levels, tested))
-    if low <= _between(chance, 1, FAR):
+    if low <= _middle(chance, 1):
         return []
     groups = (numbers for name, numbers in levels.groups.items() if name != "recording")
     varied = any(len(np.unique(numbers)) > 1 for numbers in groups)
@@ -132,13 +125,13 @@ def _compared(levels: Dataset, name: str, parts: Sequence[InnerPart]) -> list[st
     chance = _chance(levels.labels[tested], values[tested])
     low, _ = interval(inside, clusters := _clusters(levels, tested))
     least, high = interval(outside, clusters)
-    if least > _between(chance, 1, FAR):
+    if least > _middle(chance, 1):
         return [
             f"warning: the mean of each taxel alone names {outside.sum()} of {len(outside)} sweeps "
             f"(chance {_percent(chance)}), {LEFT_OUT} their {name} is left out; if each material "
             "was recorded in one go, this may be the level of that day"
         ]
-    if low <= _between(chance, 1, FAR) or high >= _between(chance, low, LEFT):
+    if low <= _middle(chance, 1) or high >= _middle(chance, low):
         return []
     several = name if name.endswith("s") else f"{name}s"
     return [
@@ -197,9 +190,12 @@ def _clusters(levels: Dataset, tested: Array) -> Array | None:
     return recording if len(np.unique(recording)) < len(recording) else None
 
 
-def _between(low: float, high: float, share: float) -> float:
-    """The number at this share of the way from `low` to `high`."""
-    return low + share * (high - low)
+def _middle(low: float, high: float) -> float:
+    """The middle of two accuracies. An accuracy is far above chance if its 95 % interval begins
+    above the middle of chance and 1: at six materials above 58 %, at two above 75 %. The interval
+    across values has to end below the middle of chance and the lower end within a value: then most
+    of the accuracy within a value is due to the group."""
+    return low + 0.5 * (high - low)
 
 
 def _percent(share: float) -> str:

@@ -29,7 +29,7 @@ from palpate_train.answer.fit_contact import AugmentedCopies, Contacts
 from palpate_train.answer.fit_early import no_limits
 from palpate_train.answer.heads import HeadData, HeadPlan
 from palpate_train.data.augment import COPIES, Augmentation, copies
-from palpate_train.data.junk import JUNK, windows
+from palpate_train.data.junk import FOR_LIMITS, JUNK, windows
 from palpate_train.data.sets import OWN_NUMBERS, Dataset
 from palpate_train.data.splitters import WEIGHT
 from palpate_train.metrics.score import outcomes
@@ -45,10 +45,10 @@ WHAT = "a fit (made by palpate-train fit)"
 HELD_COPIES_SEED, FAULTS_SEED, JUNK_SEED = 1, 2, 3
 """Added to a fit's seed for the copies of its held-out sweeps, for the copies with faults, and for
 junk."""
-JUNK_EACH, MOST_BY_JUNK = 24, 10
-"""Windows of each kind of junk that help to find the limits of known materials, and the largest
-number of sweeps of a material that need them. More sweeps show by themselves where unknown
-materials lie, and junk would only make the limit narrower for known ones."""
+MOST_BY_JUNK = 10
+"""Largest number of sweeps of a material whose limits junk helps to find. More sweeps show by
+themselves where unknown materials lie, and junk would only make the limit narrower for known
+ones."""
 FAULTS = Augmentation(
     displaced=0.0,
     gain=0.1,
@@ -342,7 +342,7 @@ def _junk(fit: Fit) -> Mapping[str, Array]:
     if np.bincount(every).min() > MOST_BY_JUNK:
         return own
     return own | {
-        kind: run(trunk, windows(kind, fit.train, JUNK_EACH, tare, seed + JUNK_SEED))
+        kind: run(trunk, windows(kind, fit.train, FOR_LIMITS, tare, seed + JUNK_SEED))
         for kind in JUNK
     }
 
