@@ -303,7 +303,9 @@ def without_numbers(fitted: Fit) -> dict[str, np.ndarray]:
 def judged(fitted: Fit) -> None:
     """Compare both precisions as export does."""
     reference, int8 = quantized_bundle.graphs(fitted)
-    quantized_bundle.check(parity.measure(int8, reference, fitted.held.samples, fitted.held.labels))
+    quantized_bundle.check(
+        *parity.measure(int8, reference, fitted.held.samples, fitted.held.labels)
+    )
 
 
 def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
@@ -369,7 +371,9 @@ def test_a_saturated_layer_and_an_old_head_are_refused(tight: Fit):
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
     """Beyond a limit the message names number, limit and remedy."""
 
-    def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
+    def found(
+        n: int = 100, lost: int = 0, won: int = 0, **apart: float
+    ) -> tuple[parity.AnswerDifference, parity.AccuracyLoss]:
         """`n` sweeps with some lost and some won by int8; the rest is perfect."""
         right = np.arange(n) >= won, np.arange(n) < n - lost
         usual = {
@@ -379,11 +383,11 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
             "probability_mean": 0,
         }
         difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
-        return parity.Parity(difference, parity.loss(*right))
+        return difference, parity.loss(*right)
 
-    quantized_bundle.check(found(**good))
+    quantized_bundle.check(*found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
-        quantized_bundle.check(found(**bad))
+        quantized_bundle.check(*found(**bad))
     assert str(refused.value).endswith(", or record more")
 
 

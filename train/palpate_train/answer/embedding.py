@@ -254,15 +254,6 @@ def _shape(away: Array) -> Array:
     return shape
 
 
-def embed_present(
-    features: Array, labels: Array, fixed: int = 0, beyond: Array = NOTHING
-) -> tuple[Embedding, Array]:
-    """The Embedding of sweeps that may lack some labels, in two views, and the labels [K] of its
-    means."""
-    present, numbered = np.unique(labels, return_inverse=True)
-    return in_two_views(features, numbered, fixed, beyond), present
-
-
 @dataclass(frozen=True, eq=False)
 class _Covariance:
     """C = diagonal + rows' rows [F, F], the covariance within materials, with `rows` [n, F]. No
@@ -371,7 +362,8 @@ def cross_fitted(
     """A JudgingPart for each of `parts`. Sweeps of a material that occurs in no other part do not
     judge."""
     for fit, numbers in parts(groups, judged):
-        embedding, present = embed_present(features[fit], labels[fit], fixed, beyond)
+        present, numbered = np.unique(labels[fit], return_inverse=True)
+        embedding = in_two_views(features[fit], numbered, fixed, beyond)
         yield fit, numbers[np.isin(labels[numbers], present)], embedding, present
 
 

@@ -22,7 +22,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from palpate.bundle import bundle
-from palpate.core import provenance, storage
+from palpate.core import storage
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
@@ -147,11 +147,6 @@ def _made(content: Content, commit: str) -> dict[str, Any]:
     }
     about = {name: value for name, value in content.about.items() if name != LICENCE}
     return made | about | {"data": card.data(content.train, content.about.get(LICENCE, ""))}
-
-
-def pack_to_measure(content: Content, target: Path) -> bundle.Manifest:
-    """Pack `content` under the name of its method, only to measure its cost."""
-    return pack(content, target, content.about["method"], "1", provenance.commit(), proven=False)
 
 
 def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:

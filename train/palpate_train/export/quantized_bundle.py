@@ -4,7 +4,7 @@ does."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
@@ -30,7 +30,7 @@ from palpate_train.models.methods import Model, model_inputs
 from palpate_train.models.recipe.fitted import Fit, FittedModel, finished
 from palpate_train.onnx_tools import parity
 from palpate_train.onnx_tools.graph_builder import run, with_head
-from palpate_train.onnx_tools.parity import Parity
+from palpate_train.onnx_tools.parity import AccuracyLoss, AnswerDifference
 
 Array = NDArray[Any]
 MOST_TORCH_DIFFERENCE = 0.01
@@ -127,21 +127,21 @@ def checked(content: Content, reference: onnx.ModelProto) -> Content:
     """`content`, whose model is int8, with a comparison with the float model `reference`. Raises
     ExportRefused as `check`."""
     held_out = content.held_out
-    found = parity.measure(
+    apart, lost = parity.measure(
         content.model,
         reference,
         model_inputs(content.input, held_out),
         held_out.labels,
         held_out.group(content.held_out_by),
     )
-    check(found)
-    return replace(content, figures=content.figures | {"parity": found.json()})
+    check(apart, lost)
+    figures = content.figures | {"parity": asdict(apart) | asdict(lost)}
+    return replace(content, figures=figures)
 
 
-def check(found: Parity) -> None:
+def check(apart: AnswerDifference, lost: AccuracyLoss) -> None:
     """Raises ExportRefused, with the number, its limit and a remedy, if int8 differs too much from
     float."""
-    apart, lost = found.answers, found.accuracy
     largest, mean = apart.probability_difference, apart.probability_mean
     why = ""
     if lost.lost > tolerances.LOST and lost.chance < CHANCE:

@@ -3,7 +3,7 @@ differ, and how much accuracy is lost, with its interval. Graphs run as on the b
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import comb
 from typing import Any
 
@@ -57,30 +57,18 @@ class AccuracyLoss:
     chance: float
 
 
-@dataclass(frozen=True)
-class Parity:
-    """The comparison of a model's two precisions on the same sweeps."""
-
-    answers: AnswerDifference
-    accuracy: AccuracyLoss
-
-    def json(self) -> dict[str, Any]:
-        """The entry of a manifest."""
-        return asdict(self.answers) | asdict(self.accuracy)
-
-
 def measure(
     int8: onnx.ModelProto,
     reference: onnx.ModelProto,
     inputs: Array,
     labels: Array,
     clusters: Array | None = None,
-) -> Parity:
+) -> tuple[AnswerDifference, AccuracyLoss]:
     """Compare `int8` with the float model `reference` on `inputs` of sweeps with `labels` [n].
     clusters: int [n]; sweeps of a cluster succeed or fail together."""
     precise, rounded = logits(reference, inputs), logits(int8, inputs)
     lost = loss(precise.argmax(1) == labels, rounded.argmax(1) == labels, clusters)
-    return Parity(compare(precise, rounded), lost)
+    return compare(precise, rounded), lost
 
 
 def logits(model: onnx.ModelProto, inputs: Array) -> Array:

@@ -247,10 +247,11 @@ def judge(
     if not found:
         raise FormatError("; ".join(f"{name}: {why}" for name, why in refused.items()))
     staged = staged or any(trunk for trunk, _ in found.values())
-    alike = {
-        name: judged if trunk or not staged else _on_held_out(judged, setup)
-        for name, (trunk, judged) in found.items()
-    }
+    alike = {name: judged for name, (_, judged) in found.items()}
+    for name, (trunk, judged) in found.items() if staged else ():
+        if trunk is None:  # the same heads on the sweeps that judge stages
+            scores = setup.scores(setup.fixed.data, [setup.judging])
+            alike[name] = HeadChoice(scores, scores.score(judged.chosen.plan.parts))
     scores = next(iter(alike.values())).scores
     return Judgement(
         setup,
@@ -263,12 +264,6 @@ def judge(
         _values(setup, len(scores.labels)) if staged else scores.clusters,
         tuple(dict.fromkeys(scores.groups.tolist())),
     )
-
-
-def _on_held_out(judged: HeadChoice, setup: Setup) -> HeadChoice:
-    """The same heads on the sweeps that judge stages."""
-    scores = setup.scores(setup.fixed.data, [setup.judging])
-    return HeadChoice(scores, scores.score(judged.chosen.plan.parts))
 
 
 def _values(setup: Setup, n: int) -> Array:

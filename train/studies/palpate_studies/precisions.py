@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from palpate.core import storage
+from palpate.core import provenance, storage
 from palpate_studies import cost
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
@@ -92,7 +92,8 @@ def _packed_forms(
             continue  # nothing in it is int8: both precisions are the same
         folder = work / precision
         about = content.about | ({"form": form} if form else {})
-        pack.pack_to_measure(replace(content, model=graph, about=about), folder)
+        measured = replace(content, model=graph, about=about)
+        pack.pack(measured, folder, about["method"], "1", provenance.commit(), proven=False)
         counted[form] = {
             "form": form,
             "precision": precision,
