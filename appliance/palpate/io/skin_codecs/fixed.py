@@ -4,7 +4,7 @@ checksum: FlexiTac, AnySkin, most self-made matrices."""
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
@@ -99,6 +99,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         else:
             raw = np.frombuffer(frame, np.uint8, p.body, plan.numbers)
             frames.frame(end, [wire_numbers.read(raw[None], p.number, p.byte_order)[0]])
+            frames.ends[-1] += plan.tail
             if p.sequence:
                 order = p.sequence_order or p.byte_order
                 counts.append(int.from_bytes(frame[plan.count], order))
@@ -107,8 +108,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         f"the {p.checksum} of {wrong} frames is wrong; correct checksum, checksum_from or"
         " checksum_order in its profile, or check the cable"
     )
-    found = frames.decoded(data, misfit if wrong else "", counts=np.array(counts, np.int64))
-    return replace(found, ends=found.ends + plan.tail, rest=Rest(found.rest.data, synced))
+    left = Rest(data[at:], synced)
+    return frames.decoded(left, misfit if wrong else "", counts=np.array(counts, np.int64))
 
 
 def _beginning(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:

@@ -136,8 +136,8 @@ class Gathering:
         whole = (steps == each * lengths).all() and (each == each[:1]).all()
         return bool(whole or (steps == steps[:1]).all())
 
-    def decoded(self, data: bytes, misfit: str = "", **more: Any) -> Decoded:
-        """What `data` holds; the rest begins with the current frame. more: as for Decoded."""
+    def decoded(self, rest: Rest, misfit: str = "", **more: Any) -> Decoded:
+        """The whole frames. rest, misfit, more: as for Decoded."""
         found = (
             np.stack(self.numbers)
             if self.numbers
@@ -149,7 +149,7 @@ class Gathering:
             np.array(self.skipped, np.int64),
             self.size,
             self.garbage,
-            Rest(data[self.begun :]),
+            rest,
             misfit=misfit,
             **more,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -66,8 +66,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
                 f"{shown((profile.rows, profile.cols))}"
             )
     clock = np.array(counts, np.int64), np.array(times_us, np.int64)
-    found = frames.decoded(data[kept:], wrong=wrong, counts=clock[0], times_us=clock[1])
-    return replace(found, rest=Rest(found.rest.data, layout=layout))
+    left = Rest(data[kept:], layout=layout)
+    return frames.decoded(left, wrong=wrong, counts=clock[0], times_us=clock[1])
 
 
 def _packets(data: bytes) -> tuple[list[Span], int]:

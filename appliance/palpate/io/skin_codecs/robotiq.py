@@ -39,7 +39,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         if len(grids) == fingers:
             frames.frame(end, [np.frombuffer(grids[i], ">u2") for i in sorted(grids)])
             grids = {}
-    return frames.decoded(data)
+    return frames.decoded(Rest(data[frames.begun :]))
 
 
 def _tsf_end(data: bytes, at: int) -> int:

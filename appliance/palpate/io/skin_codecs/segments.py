@@ -50,7 +50,7 @@ def gathered(profile: SkinProfile, marker: bytes, data: bytes, read: ReadPart) -
         frames.waste(at if at >= 0 else max(frames.begun, len(data) - len(marker) + 1))
     if len(data) - frames.begun > MOST_PACKET + 4 * profile.body:
         frames.waste(len(data))
-    return frames.decoded(data, misfit)
+    return frames.decoded(Rest(data[frames.begun :]), misfit)
 
 
 def _part(p: SkinProfile, data: bytes, at: int) -> Part | str | None:

@@ -82,7 +82,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         rows, broken = [], False
     if len(data) - frames.begun > MOST_PACKET * lines:
         frames.waste(len(data))
-    return frames.decoded(data, misfit)
+    return frames.decoded(Rest(data[frames.begun :]), misfit)
 
 
 def _indexed(profile: SkinProfile, data: bytes) -> Decoded:
@@ -105,7 +105,7 @@ def _indexed(profile: SkinProfile, data: bytes) -> Decoded:
         frames.put(begin, at, number, row)
     if len(data) - at > MOST_PACKET:
         frames.waste(len(data))
-    return frames.decoded(data, misfit)
+    return frames.decoded(Rest(data[frames.begun :]), misfit)
 
 
 @lru_cache(4)

@@ -65,7 +65,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     if len(data) - at > MOST_PACKET:
         frames.garbage, left = frames.garbage + len(left), b""
     wrong = f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
-    return frames.decoded(left, wrong=wrong if beyond >= _WRONG_TAXELS else "", foreign=foreign)
+    wrong = wrong if beyond >= _WRONG_TAXELS else ""
+    return frames.decoded(Rest(left), wrong=wrong, foreign=foreign)
 
 
 def _taxel(line: bytes) -> tuple[int, bytes]:
