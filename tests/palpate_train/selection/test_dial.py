@@ -31,7 +31,6 @@ from palpate_train.selection.dial import (
     NothingFits,
     SizeWish,
 )
-from palpate_train.selection.reduction_curves import ReducedFits
 
 CLOSED = Settings()
 CLUSTERS = np.repeat(np.arange(8), 12)
@@ -311,12 +310,13 @@ def test_less_does_not_fall_below_what_is_wanted():
     """A loss within the error is refused below the wanted accuracy."""
     less = missing(slice(1))
 
-    def fits(wanted: float) -> ReducedFits:
-        return ReducedFits(judgement(all=EVERYTHING), "all", wanted)
+    def choice(wanted: float) -> dial.Selection:
+        judged, wish = judgement(all=EVERYTHING), SizeWish(accuracy=wanted)
+        return dial.Selection(judged, wish, ["all"], {}, {}, "all", cast(Any, None))
 
-    assert fits(0.9).fine(EVERYTHING, less)
-    assert not fits(0.995).fine(EVERYTHING, less)
-    assert fits(1.0).fine(less, less)
+    assert reduction_curves.fine(choice(0.9), EVERYTHING, less)
+    assert not reduction_curves.fine(choice(0.995), EVERYTHING, less)
+    assert reduction_curves.fine(choice(1.0), less, less)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ standard error; the strongest accepted reduction is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from palpate_train.data import transforms
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.metrics.score import confusion
-from palpate_train.selection.dial import Judgement, Selection, difference, estimate, judge
+from palpate_train.selection.dial import Selection, difference, estimate, judge
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -51,69 +51,62 @@ HOW_TO_SET = {
 }
 
 
-@dataclass(frozen=True)
-class ReducedFits:
-    """Fits the chosen size to reduced sweeps. whole: the judgement of the whole sweeps."""
+def right(choice: Selection, change: Change) -> Array:
+    """bool [n], the held-out sweeps that the chosen size, fitted to reduced sweeps, classifies
+    correctly with `change`. Raises FormatError if the reduced sweeps are too short."""
+    whole = choice.judgement
+    run = replace(whole.setup.run, folder=None)
+    run.log(f"with less: {change}")
+    sweeps, settings = change.of(whole.setup.sweeps), whole.reduced(choice.chosen)
+    return judge(sweeps, run, settings, [choice.chosen], whole.staged).right(choice.chosen)
 
-    whole: Judgement
-    chosen: str
-    wanted: float
 
-    def right(self, change: Change) -> Array:
-        """bool [n], the held-out sweeps that are right with `change`. Raises FormatError if
-        the reduced sweeps are too short."""
-        whole, name = self.whole, self.chosen
-        run = replace(whole.setup.run, folder=None)
-        run.log(f"with less: {change}")
-        sweeps, settings = change.of(whole.setup.sweeps), whole.reduced(name)
-        found = judge(sweeps, run, settings, [name], whole.staged)
-        return found.right(name)
+def fine(choice: Selection, full: Array, less: Array) -> bool:
+    """Whether the reduced sweeps suffice: they lose little, and they reach the wanted accuracy if
+    the whole sweeps do."""
+    falls_short = less.mean() < choice.wanted.accuracy <= full.mean()
+    return difference(full, less, choice.judgement.clusters).within and not bool(falls_short)
 
-    def fine(self, full: Array, less: Array) -> bool:
-        """Whether the reduced sweeps suffice: they lose little, and they reach the wanted accuracy
-        if the whole sweeps do."""
-        falls_short = less.mean() < self.wanted <= full.mean()
-        return difference(full, less, self.whole.clusters).within and not bool(falls_short)
 
-    def point(self, full: Array, less: Array, step: Step) -> Json:
-        """A point of a curve for scripts."""
-        clusters = self.whole.clusters
-        return {
-            "name": step[0],
-            "share": round(step[1], 4),
-            "accuracy": estimate(less, clusters),
-            "behind": difference(full, less, clusters).json(),
-            "fine": self.fine(full, less),
-        }
+def _point(choice: Selection, full: Array, less: Array, step: Step) -> Json:
+    """A point of a curve for scripts."""
+    clusters = choice.judgement.clusters
+    return {
+        "name": step[0],
+        "share": round(step[1], 4),
+        "accuracy": estimate(less, clusters),
+        "behind": difference(full, less, clusters).json(),
+        "fine": fine(choice, full, less),
+    }
 
 
 def curves(choice: Selection, kinds: Collection[str]) -> tuple[list[Json], Change]:
     """The curves of these kinds, and the reductions of APPLIED among them as one Change."""
-    fits = ReducedFits(choice.judgement, choice.chosen, choice.wanted.accuracy)
     found: list[Json] = []
     applied = WHOLE
     for kind in kinds:
         if kind == "classes":
-            found.append(classes(fits))
+            found.append(classes(choice))
             continue
-        curve, change = _curve(fits, kind)
+        curve, change = _curve(choice, kind)
         if kind in APPLIED:
             applied = applied.and_then(change)
         found.append(curve | {"applied": kind in APPLIED and change != WHOLE})
     return found, applied
 
 
-def _curve(fits: ReducedFits, kind: str) -> tuple[Json, Change]:
-    full = fits.whole.right(fits.chosen)
+def _curve(choice: Selection, kind: str) -> tuple[Json, Change]:
+    judged = choice.judgement
+    full = judged.right(choice.chosen)
     whole: Step = ("all", 1.0, WHOLE)
-    points, kept, beyond = [fits.point(full, full, whole)], whole, 0
-    for step in STEPS[kind](fits.whole.setup.sweeps):
+    points, kept, beyond = [_point(choice, full, full, whole)], whole, 0
+    for step in STEPS[kind](judged.setup.sweeps):
         try:
-            less = fits.right(step[2])
+            less = right(choice, step[2])
         except FormatError as e:
             points.append({"name": step[0], "share": step[1], "refused": str(e)})
             break
-        points.append(fits.point(full, less, step))
+        points.append(_point(choice, full, less, step))
         beyond += not points[-1]["fine"]
         if beyond == POINTS_BEYOND:
             break
@@ -121,7 +114,7 @@ def _curve(fits: ReducedFits, kind: str) -> tuple[Json, Change]:
             kept = step
     change = kept[2]
     how_to_set = HOW_TO_SET[kind].format(change.rate) if change != WHOLE else ""
-    cols = fits.whole.setup.sweeps.format.cols
+    cols = judged.setup.sweeps.format.cols
     taxels = {"taxels": [list(divmod(t, cols)) for t in sorted(change.taxels)]}
     return {"kind": kind, "points": points, "kept": kept[0], "set": how_to_set} | (
         taxels if change.taxels else {}
@@ -165,19 +158,20 @@ STEPS: dict[str, Callable[[Dataset], Iterator[Step]]] = {
 }
 
 
-def classes(fits: ReducedFits) -> Json:
+def classes(choice: Selection) -> Json:
     """The accuracy gained by merging materials, the most confused pair first, counted without
     another fit.
 
     Pairs are proposed that are CONFUSED, and as many as are needed for the wanted accuracy. Nothing
     is applied: only the user knows whether two materials may share a label.
     """
-    names: list[tuple[str, ...]] = [(name,) for name in fits.whole.setup.sweeps.materials]
-    label, named, total = fits.whole.labels, fits.whole.sizes[fits.chosen].named, len(names)
+    judged = choice.judgement
+    names: list[tuple[str, ...]] = [(name,) for name in judged.setup.sweeps.materials]
+    label, named, total = judged.labels, judged.sizes[choice.chosen].named, len(names)
     points: list[Json] = []
     proposed, merged, proposing = list(names), "", True
     while True:
-        accuracy = estimate(named == label, fits.whole.clusters)
+        accuracy = estimate(named == label, judged.clusters)
         points.append(
             {
                 "name": f"{len(names)}",
@@ -192,7 +186,7 @@ def classes(fits: ReducedFits) -> Json:
         a, b = (int(i) for i in np.unravel_index(confused.argmax(), confused.shape))
         names[a], merged = names[a] + names[b], " + ".join(names[a] + names[b])
         names.pop(b)
-        wanting = accuracy["mean"] < fits.wanted
+        wanting = accuracy["mean"] < choice.wanted.accuracy
         if proposing := proposing and (confused[a, b] >= CONFUSED or wanting):
             proposed = list(names)
         label, named = (np.where(x == b, a, x - (x > b)) for x in (label, named))
