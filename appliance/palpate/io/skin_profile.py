@@ -35,7 +35,7 @@ NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 _GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
 _USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
 _BYTE = rf"([0-9a-fA-F]{{2}}|{{(period_ms|bytes|{'|'.join(checksums.NAMED)})}})"
-_COMMAND = re.compile(rf"(?s:(?=.{{1,128}}\Z)((?!hex:).*|hex:(\s*{_BYTE})+\s*))")
+_COMMAND = re.compile(rf"(?s:(?=.{{1,128}}\Z)((?!hex:).*|hex:(\s*{_BYTE})+\s*))", re.ASCII)
 _NEEDED = ("about", "source", "codec")
 
 
@@ -186,10 +186,10 @@ class SkinProfile:
 
     def _binary(self, text: str) -> bytes:
         body = self.body.to_bytes(2, self.byte_order)
-        before, sign, after = text.replace("{bytes}", body.hex()).partition("{")
-        data = bytes.fromhex(before)
+        before, sign, after = text.replace("{bytes}", body.hex()).rpartition("{")
         if not sign:
-            return data
+            return bytes.fromhex(after)
+        data = self._binary(before)
         name, _, rest = after.partition("}")
         checksum = checksums.NAMED[name]
         order = self.checksum_order or self.byte_order

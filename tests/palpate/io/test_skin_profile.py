@@ -53,6 +53,7 @@ def written(tmp_path: Path, text: str) -> Path:
         (GOOD + "rate_hz = nan", "a number from 0.1"),
         (GOOD + "rates_hz = [0]", "from 0.1 to 100000"),
         (GOOD + 'start = ["hex:9"]', "commands such as"),
+        (GOOD + 'start = ["hex:01\u00a002"]', "commands such as"),
         (GOOD + "start = [1]", "commands such as"),
         (GOOD.replace('marker = "aa 55"\n', ""), "needs a marker or a trailer"),
         (GOOD.replace("fixed", "text"), "has marker"),
@@ -197,6 +198,7 @@ def test_commands_and_slow_skins():
     assert p.commands(texts, 250.0) == [b"f250\n", b"p4\n", b"\x9a\x00\x04", b"\x00\xff"]
     assert p.commands(["hex:{period_ms}"], 0.5) == [b"\xff"]
     assert p.commands(["hex:{period_ms}"], 5000) == [b"\x01"]
+    assert p.commands(["hex:01 {sum8} 02 {sum8}"], 250.0) == [b"\x01\x01\x02\x04"]
     assert warning(SweepFormat(4, 4, 100, 200, "uint8")) == ""
     assert "56" in warning(SweepFormat(5, 1, 28, 56, "float32", 3))
     assert "1.5" in warning(SweepFormat(5, 1, 28, 56, "float32", 3))
