@@ -231,7 +231,9 @@ class Shadow(Observer):
         self._sweeps.close()
 
     def _written(self, succeeded: bool) -> None:
-        self.agreement.kept -= not succeeded
+        if not succeeded:
+            self.agreement.kept -= 1
+            self._due_ns = 0  # the counts written meanwhile include it
 
     def _begin(self, candidate: str, current: str) -> Agreement:
         """The agreement to continue, or a new agreement, with this start counted."""

@@ -28,7 +28,7 @@ from palpate.inference.classifier import Classifier
 from palpate.sim import rig, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND
-from tests.factories.slow_disk import SlowDisk
+from tests.factories.slow_disk import SlowDisk, full
 
 IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim", *[0] * 6)
 
@@ -152,6 +152,18 @@ def test_a_sweep_that_is_being_written_counts_for_the_limit(side, monkeypatch):
     pair.judge(toy_bundle.sweep(0, 0, 4))
     disk.settle()
     assert (len(pair.kept()), pair.written().kept) == (2, 2)
+
+
+def test_a_sweep_that_could_not_be_kept_is_not_counted(side, monkeypatch):
+    """Though the counts could be written, which are small."""
+    pair, disk = side(renamed), SlowDisk()
+    monkeypatch.setattr(pair.shadow, "_disk", disk)
+    monkeypatch.setattr(pair.shadow._sweeps, "put", full)
+    pair.judge(A)
+    disk.settle()
+    pair.turn()
+    disk.settle()
+    assert (pair.written().compared, pair.written().kept) == (1, 0)
 
 
 def test_it_fuses_by_the_same_rule(side):
