@@ -47,7 +47,7 @@ class ReportStore:
     goal = GOAL
 
     def __init__(self, folder: Path, report: ReleaseReport) -> None:
-        self._folder, self._report = folder, report
+        self._folder, self._report, self._why = folder, report, report.why
 
     def note(self, sha: str, progress: TrialProgress, *, counted: bool) -> None:
         """Record the progress."""
@@ -62,10 +62,10 @@ class ReportStore:
 
     def failed(self, why: str) -> None:
         """From the next report on, the release must go back."""
-        self._report = replace(self._report, why=why)
+        self._why = why
 
     def _write(self, report: ReleaseReport) -> None:
-        releases.write_report(self._folder, report)
+        releases.write_report(self._folder, replace(report, why=self._why))
         self._report = report
 
 

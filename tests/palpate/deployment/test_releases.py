@@ -329,6 +329,23 @@ def test_a_release_that_answers_otherwise_goes_back_within_fifty_sweeps(box: Tri
     assert (box.runs, box.releases.rejected[NEW][0]) == (OLD, "2 of 40")
 
 
+def test_a_fault_during_a_write_sends_the_release_back(box: TrialBox, monkeypatch):
+    """The disk thread writes progress while the loop finds a sweep without an answer."""
+    trial, write = box.start(), releases.write_report
+    assert trial
+
+    def slow(*report: object) -> None:
+        monkeypatch.setattr(releases, "write_report", write)
+        trial.goes_back("2 of 40")
+        write(*report)
+
+    monkeypatch.setattr(releases, "write_report", slow)
+    trial.turn(health(1, streams=False))
+    trial.stopping()
+    box.start()
+    assert box.releases.rejected[NEW][0] == "2 of 40"
+
+
 @pytest.mark.parametrize("program", ["exit 0", "exit 1", "echo of an old release; exit 2"])
 def test_a_release_that_answers_alike_stays(box: TrialBox, program: str):
     """Also if the proven release cannot compare; five comparisons, and no more."""
