@@ -100,7 +100,7 @@ class Trial(Observer):
         """At an orderly end of the program: do not count this start."""
         self.disk.settle()
         if not self._over:
-            self._log.attempt(self._note(False), ERRORS)
+            self._over = self._log.attempt(self._note(False), ERRORS)
 
     def __enter__(self) -> Trial:
         return self

@@ -260,6 +260,15 @@ def test_what_ends_the_program_decides_whether_the_start_counts(box, error, coun
     assert box.standing.starts == counts
 
 
+def test_an_orderly_end_is_written_once(box, monkeypatch):
+    """By the loop and then by the context; a bad card takes seconds for each write."""
+    notes: list[bool] = []
+    with box.tried() as trial:
+        monkeypatch.setattr(box.store, "note", lambda *of, counted: notes.append(counted))
+        trial.stopping()
+    assert notes == [False]
+
+
 def test_a_full_disk_is_told_once_and_tried_again(box, monkeypatch, logged):
     """Nothing is raised; the commit comes when the disk can be written again."""
     trial = box.tried()
