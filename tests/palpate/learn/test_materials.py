@@ -359,8 +359,8 @@ def test_a_trained_material_is_refused_before_a_sweep(box, capsys):
     with ExitStack() as stack:
         phase = TryingPhase(program, stack)
         with pytest.raises(ConfigError, match="'foam'"):
-            phase.obey(command("TEACH", "foam"))
-        assert phase.obey(command("TEACH", "cork")) == ["cork"]
+            phase.orders["TEACH"]("foam")
+        assert phase.orders["TEACH"]("cork") == ["cork"]
 
 
 @contextmanager
@@ -407,4 +407,4 @@ def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
             assert ("teach" in refused) is not allowed, name
             assert allowed or phase.about() == before
         for name, text in orders:
-            assert phase.obey(command(name, text))
+            assert phase.orders[name](text)
