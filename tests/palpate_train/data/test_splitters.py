@@ -153,6 +153,18 @@ def test_clusters_and_learning_curves_follow_the_split():
     assert draw(train, labels, 99, 1).tolist() == train.tolist()
 
 
+def test_no_part_leaves_one_sweep_of_each_material():
+    """That does not show how a material varies: recordings serve, and too few are said at once."""
+    sweeps = a_set([0, 0, 0, 1, 1, 1], recording=[*range(6)], force=[0, 1, 1, 0, 1, 1])
+    assert {part.group for part in inner_parts(sweeps)} == {"force"}
+    even = a_set([0, 0, 1, 1, 2, 2, 2], recording=[*range(7)], force=[0, 1, 0, 1, 0, 1, 1])
+    assert [part.out.tolist() for part in inner_parts(even)] == [
+        (even.group("force") == 0).tolist()
+    ]
+    with pytest.raises(FormatError, match=r"4 sweeps of 2 .* three of each"):
+        inner_parts(a_set([0, 0, 1, 1], recording=[*range(4)], force=[0, 1, 0, 1]))
+
+
 @settings(max_examples=30)
 @given(st.integers(2, 5), st.integers(0, 99), st.integers(1, 4), st.booleans())
 def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixed: bool):

@@ -217,7 +217,8 @@ def inner_parts(sweeps: Dataset, varies: Sequence[str] = ()) -> list[InnerPart]:
 
     The first part of every group comes first, then the second parts, and so on. A group can be left
     out if it does not cut recordings in two, and if the other sweeps hold every material that is
-    tested. Raises FormatError if nothing can be left out, or a group of `varies` cannot.
+    tested and two of one. Raises FormatError if nothing can be left out, or a group of `varies`
+    cannot.
     """
     names = varies or sorted(set(sweeps.groups) - set(OF_THE_SET))
     of_all = [_parts_of(sweeps, name) for name in names]
@@ -234,7 +235,7 @@ def inner_parts(sweeps: Dataset, varies: Sequence[str] = ()) -> list[InnerPart]:
 
 def recording_parts(sweeps: Dataset) -> list[InnerPart]:
     """Parts of recordings, with materials spread evenly; each sweep is in one of them. Raises
-    FormatError if a material has one recording."""
+    FormatError if a material has one recording, or if one sweep of each would be left."""
     fewest = min(
         len(np.unique(sweeps.group("recording")[sweeps.labels == k]))
         for k in np.unique(sweeps.labels)
@@ -245,7 +246,18 @@ def recording_parts(sweeps: Dataset) -> list[InnerPart]:
             "choosing a model needs two of each, so record more"
         )
     drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
-    return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
+    parts = [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
+    if not all(_varied(sweeps.labels[~part.out]) for part in parts):
+        raise FormatError(
+            f"{sweeps.source}: {len(sweeps)} sweeps of {len(np.unique(sweeps.labels))} materials "
+            "are too few to choose a model, which leaves some of each out; record three of each"
+        )
+    return parts
+
+
+def _varied(labels: Array) -> bool:
+    """Whether some material has two sweeps, which show how a material varies."""
+    return len(labels) > len(np.unique(labels))
 
 
 def _parts_of(sweeps: Dataset, name: str) -> list[InnerPart]:
@@ -260,4 +272,9 @@ def _parts_of(sweeps: Dataset, name: str) -> list[InnerPart]:
         np.isin(member, some) for some in np.array_split(shuffled, min(MOST_PARTS, len(shuffled)))
     ]
     labels = sweeps.labels
-    return [InnerPart(name, out) for out in parts if set(labels[out]) <= set(labels[~out])]
+    rests = [(out, labels[~out]) for out in parts]
+    return [
+        InnerPart(name, out)
+        for out, rest in rests
+        if set(labels[out]) <= set(rest) and _varied(rest)
+    ]

@@ -28,7 +28,7 @@ PROTOCOLS = (
 """The two selections of the set that have all combinations of their conditions, and the protocols
 of each."""
 SEED = 1
-EACH = (2, 5, 10, 20)
+EACH = (3, 5, 10, 20)
 """Training sweeps of each material in the study `shots`."""
 SHOT_PEERS, SHOT_PROTOCOL = ("minirocket", "ds-cnn"), "leave:force"
 
