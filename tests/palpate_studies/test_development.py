@@ -203,6 +203,26 @@ def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[
     return run, development_experiment.results(run, names, cases)
 
 
+def test_results_of_named_methods_are_replaced_and_all_others_stay():
+    """A run stays named while a result of one of its methods does."""
+    held = figures()
+    again = {"methods": ["quant", "L"], "seeds": [1], "commit": "4567"}
+    better = [entry("one", "quant", 0.95), entry(SERIES, "quant", 0.96), entry("one", "L", 0.5)]
+    new = figures(methods=again["methods"], runs=[again], results=better, cases=[case("one")])
+    made = development_experiment.joined(held, new)
+    found = {(one["case"], one["method"]): one["mean"] for one in made["results"]}
+    assert (found["one", "quant"], found["one", "palpate"]) == (0.95, 0.9)
+    assert (found["two", "quant"], found["one", "L"]) == (0.755, 0.5)
+    assert len(made["results"]) == len(held["results"]) + 1
+    assert made["methods"] == [*held["methods"], "L"]
+    assert [run["methods"] for run in made["runs"]] == [again["methods"], held["methods"]]
+    assert [one["case"] for one in made["cases"]] == ["one", "two", SERIES]
+    assert made["times"] == held["times"]
+    third = figures(results=[entry(name, "quant", 0.7) for name in ("one", "two", SERIES)])
+    left = development_experiment.joined(made, third)["runs"][1:]
+    assert [run["methods"] for run in left] == [["L"], ["palpate", "quick <b>"]]
+
+
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):

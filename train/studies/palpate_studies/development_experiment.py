@@ -101,6 +101,24 @@ def results(run: StudyRun, names: Sequence[str], tested: Mapping[str, StudyCase]
     }
 
 
+def joined(held: Json, new: Json) -> Json:
+    """The results `held` with those of `new`, which replace results of the same case and method. A
+    run is named while a result of one of its methods is left."""
+    found, replaced = (
+        {(one["case"], one["method"]): one for one in made["results"]} for made in (held, new)
+    )
+    left = {method for case, method in found if (case, method) not in replaced}
+    runs = [run | {"methods": [m for m in run["methods"] if m in left]} for run in held["runs"]]
+    cases = {one["case"]: one for one in (*held["cases"], *new["cases"])}
+    return held | {
+        "methods": list(dict.fromkeys([*held["methods"], *new["methods"]])),
+        "runs": [*new["runs"], *(run for run in runs if run["methods"])],
+        "cases": list(cases.values()),
+        "results": list((found | replaced).values()),
+        "left_out": held["left_out"] | new["left_out"],
+    }
+
+
 def _evaluated(
     name: str, sweeps: Dataset, plan: Plan, run: StudyRun, progress: str
 ) -> Iterator[Json]:

@@ -33,7 +33,8 @@ _OPTIONS: Mapping[str, tuple[Row, ...]] = {
     "paper": (),
     "development": (
         _SEEDS,
-        ("--method", "(ours, as fit trains it, and the peers)", text(_METHOD)),
+        ("--method", "replace these in --out (ours, as fit trains it, and the peers)",
+            text(_METHOD)),
         ("--times", "measure the times of the results in --out again, and keep their accuracies",
             FLAG),
     ),
@@ -93,6 +94,8 @@ def run_development(args: argparse.Namespace) -> None:
         figures = read(args.out, *keys)
     else:
         figures = development_experiment.results(run, tuple(names))
+        if args.method and args.out.exists():
+            figures = development_experiment.joined(read(args.out, *keys), figures)
     if args.times or not args.kept:
         train = development_times.TIMED.load()
         assert train is not None  # it is simulated
