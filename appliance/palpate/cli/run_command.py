@@ -87,7 +87,7 @@ def _classify(
             of = choice.folder if choice else Path(settings.classifier.bundle)
             compared = release_trial.comparison(release, kept, of)
         reports = _reports(settings, current, devices.source, facts)
-        watching = Notifier(SystemClock()), trial, release, shadow, kept, compared, *reports
+        watching = Notifier(SystemClock()), trial, release, kept, compared, shadow, *reports
         observers = [disk, *filter(None, watching)]
         recorded = assembly.capture(args.capture, settings, current.format, stack)
         parts = settings, current, devices, port, stack

@@ -7,6 +7,7 @@ candidate cannot affect the robot, since it gets a sweep only after the answer w
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -145,7 +146,7 @@ class Shadow(Observer):
         classifier: Callable[[Bundle], Classifier],
         disk: DiskWork | None = None,
     ) -> None:
-        self._disk = disk or AtOnce()
+        self._disk, self._busy = disk or AtOnce(), False
         if candidate.format != current.format:
             raise BundleError(
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service "
@@ -161,6 +162,7 @@ class Shadow(Observer):
         self._log = TroubleLog(
             f"shadow: {folder} cannot be written", "make room there; classifying goes on"
         )
+        self._waiting: deque[Callable[[], object]] = deque()  # to keep a sweep
         self._settled_ns = self._due_ns = clock.now_ns() + PERIOD_NS
         try:
             self._sweeps = SweepFolder(folder, current.format)
@@ -179,7 +181,7 @@ class Shadow(Observer):
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Classify a sweep that has a window with the candidate. If the answers differ, the sweep
-        is kept."""
+        is kept in a later turn."""
         if self._failures_in_row == FAILURES or not len(sweep.frames):
             return
         tare = np.asarray(circumstances["tare"], np.float64)
@@ -206,34 +208,43 @@ class Shadow(Observer):
             self.agreement.later += 1
         elif not self.agreement.add(verdict, other, took_ns / 1e6):
             self._due_ns = begin_ns
-            if self.agreement.kept < KEPT:
+            if self.agreement.kept + self._busy + len(self._waiting) < KEPT:
                 about = {**circumstances, "candidate": other.as_dict()}
-                kept = partial(self._sweeps.put, sweep, verdict, about)
-                self.agreement.kept += 1
-                if not self._disk(lambda: self._log.attempt(kept), self._written):
-                    self._written(False)
+                self._waiting.append(partial(self._sweeps.put, sweep, verdict, about))
 
     def turn(self, health: Health) -> None:
-        """At the end of a turn: write the counts if they are due, unless a sweep is open."""
-        if not health.sweeping and self._clock.now_ns() >= self._due_ns:
+        """At the end of a turn: write one file. More would take the black box's room in the queue
+        of a slow disk. The counts come last, and not while a sweep is open."""
+        if self._busy:
+            return
+        if self._waiting:
+            self._write(self._waiting.popleft(), kept=1)
+        elif not health.sweeping and self._clock.now_ns() >= self._due_ns:
             self._due_ns = NEVER_NS
             if self._clock.now_ns() >= self._settled_ns:
                 self.agreement.starts = 0
-            counts = partial(storage.put, self._sweeps.folder / FILE, self.agreement.json())
-            self._disk(lambda: self._log.attempt(counts))
+            self._write(partial(storage.put, self._sweeps.folder / FILE, self.agreement.json()))
 
     def stopping(self) -> None:
-        """At an orderly end of the loop: write the counts, without this start."""
+        """At an orderly end of the loop: write all, without this start."""
         self._disk.settle()
+        while self._waiting:
+            self.agreement.kept += self._log.attempt(self._waiting.popleft())
         self.agreement.starts = 0
         counts = self.agreement.json()
         self._log.attempt(partial(storage.put, self._sweeps.folder / FILE, counts))
         self._sweeps.close()
 
-    def _written(self, succeeded: bool) -> None:
-        if not succeeded:
-            self.agreement.kept -= 1
-            self._due_ns = 0  # the counts written meanwhile include it
+    def _write(self, act: Callable[[], object], kept: int = 0) -> None:
+        """Do `act` next to the loop. kept: sweeps that it adds to the folder."""
+
+        def done(succeeded: bool) -> None:
+            self._busy = False
+            self.agreement.kept += kept * succeeded
+
+        self._busy = True
+        if not self._disk(lambda: self._log.attempt(act), done):
+            done(False)
 
     def _begin(self, candidate: str, current: str) -> Agreement:
         """The agreement to continue, or a new agreement, with this start counted."""

@@ -154,8 +154,22 @@ def test_a_sweep_that_is_being_written_counts_for_the_limit(side, monkeypatch):
     assert (len(pair.kept()), pair.written().kept) == (2, 2)
 
 
+def test_a_disk_that_stands_still_has_room_for_the_black_box(side, monkeypatch):
+    """One file waits there; no sweep is lost, however many wait for it, nor at the end."""
+    pair, disk = side(renamed), SlowDisk()
+    monkeypatch.setattr(pair.shadow, "_disk", disk)
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 21)))
+    assert len(disk._work) == 1
+    for _ in range(10):
+        disk.settle()
+        pair.turn()
+    assert len(pair.kept()) == 10
+    pair.shadow.stopping()
+    assert (len(pair.kept()), pair.written().kept, pair.written().compared) == (20, 20, 20)
+
+
 def test_a_sweep_that_could_not_be_kept_is_not_counted(side, monkeypatch):
-    """Though the counts could be written, which are small."""
+    """Though the counts can be written, which are small."""
     pair, disk = side(renamed), SlowDisk()
     monkeypatch.setattr(pair.shadow, "_disk", disk)
     monkeypatch.setattr(pair.shadow._sweeps, "put", full)
