@@ -28,6 +28,7 @@ from palpate.core.schema import typed
 from palpate.core.statistics import wilson
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.deployment.state import MOST_STARTS
+from palpate.deployment.trial import NEVER_NS
 from palpate.inference.classifier import Classifier, EarlyExit
 from palpate.sweeps.sweep_folder import SweepFolder
 
@@ -45,7 +46,6 @@ besides the 60 of the service, which may have 256 MB (systemd/palpate.service)."
 PERIOD_NS = 60_000_000_000
 """Interval at which the counts are written while both bundles agree. After MOST_STARTS starts in a
 row that did not last as long, the candidate is no longer loaded."""
-NEVER_NS = 1 << 63
 
 
 @dataclass(slots=True)

@@ -23,6 +23,7 @@ from palpate.deployment.state import Goal, Standing, TrialProgress
 
 RETRY_NS = 10_000_000_000
 """Pause after a failed write."""
+NEVER_NS = 1 << 63
 WORKED_S = 300.0
 """A start has made progress after a sweep with a label, or after so much time in which the skin
 streamed. Progress is recorded as often: a cell may be switched off without an orderly end."""
@@ -132,9 +133,11 @@ class Trial(Observer):
             return
 
         def written(succeeded: bool) -> None:
+            self._next_ns = 0
             if not succeeded:
                 self._over, self._stale, self._next_ns = False, True, health.time_ns + RETRY_NS
 
+        self._next_ns = NEVER_NS  # one write at a time
         if not self.disk(lambda: self._log.attempt(act, ERRORS), written):
             written(False)
 

@@ -21,6 +21,7 @@ from tests.factories import deliveries
 from tests.factories.deliveries import Delivery
 from tests.factories.feeds import health
 from tests.factories.simulated_box import tubes
+from tests.factories.slow_disk import SlowDisk
 
 pytestmark = deliveries.NEEDED
 Ready = tuple[str, str, str]
@@ -267,6 +268,20 @@ def test_an_orderly_end_is_written_once(box, monkeypatch):
         monkeypatch.setattr(box.store, "note", lambda *of, counted: notes.append(counted))
         trial.stopping()
     assert notes == [False]
+
+
+def test_a_disk_that_stands_still_has_room_for_sweeps(box, monkeypatch):
+    """One write of the trial waits there, though the skin comes and goes; the last state holds."""
+    trial, disk = box.tried(), SlowDisk()
+    monkeypatch.setattr(trial, "disk", disk)
+    for t in range(20):
+        trial.turn(health(t, streams=t % 2 == 1))
+    assert len(disk._work) == 1
+    disk.settle()
+    assert box.standing.starts == 0
+    trial.turn(health(20))
+    disk.settle()
+    assert box.standing.starts == 1
 
 
 def test_a_full_disk_is_told_once_and_tried_again(box, monkeypatch, logged):
