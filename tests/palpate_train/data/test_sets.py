@@ -239,6 +239,16 @@ def test_split_refuses_what_would_flatter():
             s.split("material", share, 0)
 
 
+def test_join_holds_the_materials_of_all_sets():
+    """Each sweep keeps its material, though sets know others or have them in another order."""
+    a = easy(4)
+    b = replace(a, materials=("z", *a.materials[::-1][1:]))
+    both = sets.join([a, b])
+    assert both.materials == (*a.materials, "z")
+    named = [np.array(s.materials)[s.labels] for s in (a, b)]
+    np.testing.assert_array_equal(np.array(both.materials)[both.labels], np.concatenate(named))
+
+
 def test_join_keeps_recordings_apart_and_forces_together():
     """Number 0 becomes two, a speed of 2 stays 2; `set` counts in the given order."""
     a, b = easy(4, pieces=2), easy(4, seed=1)

@@ -215,13 +215,13 @@ def load(spec: str, seed: int = 0) -> Dataset:
 
 
 def join(sets: Sequence[Dataset]) -> Dataset:
-    """Join sets that have the same format and materials. Groups are all that the sets share, and
-    `set`, the index of the set.
+    """Join sets that have the same format, with the materials of all. Groups are all that the sets
+    share, and `set`, the index of the set.
 
     The numbers of recordings, positions, sessions and objects are changed, because number 0 means
     another position in another set. All other values stay, in the unit of the first set. If the
     skin was tared between the sets, they are brought to one level, as in a folder. A single set is
-    not changed. Raises FormatError if formats, materials or kinds of units differ.
+    not changed. Raises FormatError if formats or kinds of units differ.
     """
     if len(sets) == 1:
         return sets[0]
@@ -233,7 +233,7 @@ def join(sets: Sequence[Dataset]) -> Dataset:
 def _joined(sets: Sequence[Dataset]) -> Dataset:
     head, *others = sets
     for s in others:
-        if (s.format, s.materials) != (head.format, head.materials):
+        if s.format != head.format:
             raise FormatError(
                 f"{s.source} ({s.format}) and {head.source} ({head.format}) differ; "
                 "join sets of one kind"
@@ -250,12 +250,15 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
         groups[name], unit = group_values.joined(name, parts, [s.units.get(name, "") for s in sets])
         units |= {name: unit} if unit else {}
     samples = mapped.joined([s.samples for s in sets])
-    labels = np.concatenate([s.labels for s in sets])
+    materials = tuple(dict.fromkeys(name for s in sets for name in s.materials))
+    labels = np.concatenate(
+        [np.array([materials.index(name) for name in s.materials])[s.labels] for s in sets]
+    )
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
     if unloaded is not None:  # each set is consistent, but levels may differ between sets
         samples, unloaded, remark = readers.align_tare(samples, unloaded)
         source += remark
-    made = Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded, units)
+    made = Dataset(samples, labels, materials, head.rate_hz, groups, source, unloaded, units)
     return replace(made, displays={k: v for s in reversed(sets) for k, v in s.displays.items()})
 
 
