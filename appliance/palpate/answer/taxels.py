@@ -67,7 +67,7 @@ class LoadModes:
 
     mean: _Row
     modes: Annotated[tuple[_Row, ...], Within(1, 8)]
-    rest: Annotated[float, Within(LEAST, _MOST)]
+    rest: Annotated[float, Within(LEAST, _MOST**2)]
 
     def __post_init__(self) -> None:
         check(self, "bridging.loads")

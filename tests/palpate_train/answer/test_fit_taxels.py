@@ -85,6 +85,13 @@ def test_a_bundle_that_needs_one_taxel_tolerates_none(tmp_path: Path):
     assert found.figures["one row"]["at"] == "row 1"
 
 
+def test_nothing_is_bridged_where_a_taxel_of_the_sound_skin_is_silent(tmp_path: Path):
+    """A bundle that bridges nothing more would refuse the taxel at full scale in every sweep."""
+    loaded, sweeps = bundle.load(toy(tmp_path)), windows("a", "b", "c")
+    sweeps.samples[:, :, 3, 3] = 255
+    assert fit_taxels.measure(loaded, sweeps, sweeps) is None
+
+
 @pytest.mark.slow
 def test_a_bundle_that_needs_no_single_taxel_tolerates_a_quarter(tmp_path: Path):
     """All sweeps are of "a", which every taxel shows."""
@@ -161,6 +168,14 @@ def test_a_bundle_answers_clipped_sweeps_as_far_as_it_names_them(tmp_path: Path)
     assert f"answered up to {100 * many.saturated:.1f} % at full scale" in fit_taxels.text(manifest)
     assert bundle.Manifest.parse(manifest.json()) == manifest
     assert few.written(manifest).thresholds == manifest.thresholds  # as the skin needs
+
+
+@pytest.mark.parametrize("scale", [1e6, 1e9])
+def test_large_counts_keep_their_modes_as_far_as_a_manifest_holds_them(scale: float):
+    """Counts of 24 bits have variances beyond counts; a mean of 1e10 bridges by neighbours."""
+    samples = scale * np.random.default_rng(0).normal(5, 1, (9, 20, 4, 4)).astype(np.float32)
+    sweeps = Dataset(samples, np.arange(9) % 2, ("a", "b"), 100.0, {}, "x")
+    assert bool(fit_taxels.load_modes(sweeps)) == (scale == 1e6)
 
 
 @pytest.mark.parametrize("shape", [(9, 20, 1, 3), (9, 20, 20, 20), (3, 20, 4, 4)])

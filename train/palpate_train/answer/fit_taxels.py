@@ -23,6 +23,7 @@ from palpate.answer.window import Window
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
+from palpate.core.errors import BundleError
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import ModelRunner
@@ -79,9 +80,10 @@ class Tolerance:
         return replace(manifest, bridging=self.bridging, thresholds=limits, figures=figures)
 
 
-def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) -> Tolerance:
-    """The broken taxels that `bundle` tolerates. sound: sweeps of a sound skin, from which the
-    limits are learned. held_out: sweeps that judge, best by a bundle that did not see them."""
+def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) -> Tolerance | None:
+    """The broken taxels that `bundle` tolerates; None if sound sweeps would be refused. sound:
+    sweeps of a sound skin, from which the limits are learned. held_out: sweeps that judge, best by
+    a bundle that did not see them."""
     rows, cols = bundle.format.rows, bundle.format.cols
     limits = learned(sound)
     trial = replace(limits, taxels=rows * cols - 1, row=True, column=True)
@@ -103,7 +105,10 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
             lines[name], figures[f"one {name}"] = bench.judged(mask)
     row, column = lines["row"], lines["column"]
     limits = replace(limits, taxels=taxels, row=row, column=column)
-    saturated, figures[CLIPPED] = bench.by(limits).clipped()
+    found = bench.by(limits)
+    if not bench.near(found.clean[0], found.clean[1], LOST):  # a taxel is always at full scale
+        return None
+    saturated, figures[CLIPPED] = found.clipped()
     return Tolerance(limits, saturated, figures)
 
 
@@ -134,10 +139,11 @@ def load_modes(sound: Dataset) -> LoadModes | None:
     away = loads - loads.mean(axis=0)
     variances, axes = np.linalg.eigh(away.T @ away / len(away))
     rest = float(variances[:-MODES].mean())
-    if not rest > 0:
-        return None
     modes = np.sqrt(variances[-MODES:] - rest) * axes[:, -MODES:]
-    return LoadModes(_short(loads.mean(axis=0)), tuple(map(_short, modes.T)), *_short([rest]))
+    try:
+        return LoadModes(_short(loads.mean(axis=0)), tuple(map(_short, modes.T)), *_short([rest]))
+    except BundleError:  # no noise, or counts beyond those that a manifest holds
+        return None
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:
@@ -233,20 +239,20 @@ class _Bench:
             samples = clipping.apply(self._test, severity, self._seed)
             right, wrong, _ = self._counts(replace(self._test.sweeps, samples=samples))
             figures[f"{severity:g}"] = [right, wrong]
-            if not self._near(right, wrong, LOST_CLIPPED):
+            if not self.near(right, wrong, LOST_CLIPPED):
                 break
             checks = (self._box.taxels.repaired(one, self._box.tare)[1] for one in samples)
             limit = max(found.full for found in checks)
         return limit, figures
 
-    def _near(self, right: int, wrong: int, lost: float) -> bool:
+    def near(self, right: int, wrong: int, lost: float) -> bool:
         """Whether counts differ from the counts of sound sweeps by at most the share `lost` of
         right answers and WRONG of wrong ones."""
         n, (clean, clean_wrong) = len(self._test.sweeps), self.clean
         return right >= clean - max(1, lost * n) and wrong <= clean_wrong + max(1, WRONG * n)
 
     def _holds(self, counts: Mapping[str, list[int]]) -> bool:
-        return all(self._near(counts[fault][0], counts[fault][1], LOST) for fault in SILENT)
+        return all(self.near(counts[fault][0], counts[fault][1], LOST) for fault in SILENT)
 
     def _with(self, fault: str, mask: Array, test: EvaluationSweeps) -> list[Any]:
         """The `_counts` with a fault, computed once: single taxels are searched twice, and of few

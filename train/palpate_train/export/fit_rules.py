@@ -179,8 +179,9 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
             manifest = replace(packed.manifest, early=None)
             classes = content.unseen.classes
             judging = replace(packed, manifest=manifest, model=model, classes=classes)
-        if not packed.manifest.thresholds.dead_taxels:
-            found = fit_taxels.measure(judging, content.train, content.held_out, seed)
+        silent = packed.manifest.thresholds.dead_taxels
+        measured = judging, content.train, content.held_out, seed
+        if not silent and (found := fit_taxels.measure(*measured)):
             packed, judging = (
                 replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
             )
