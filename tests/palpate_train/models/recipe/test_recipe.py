@@ -371,7 +371,7 @@ def test_a_condition_that_cannot_be_left_out_is_refused():
     """The error names it."""
     for name in ("recording ", "speed"):
         with pytest.raises(FormatError, match=name):
-            recipe.fit(varied(), Run(1), replace(CLOSED, varies=(name,)))
+            recipe.Setup.of(varied(), Run(1), replace(CLOSED, varies=(name,)))
 
 
 def test_what_cannot_be_fitted_is_named():

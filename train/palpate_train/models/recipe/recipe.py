@@ -117,11 +117,13 @@ class Setup:
 
     @classmethod
     def of(cls, sweeps: Dataset, run: Run, settings: Settings) -> Setup:
-        """Raises FormatError if the window is too short."""
+        """Raises FormatError if the window is too short, or if nothing can be held out."""
         groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
         sweeps = thinned(replace(sweeps, groups=groups), settings.most)
         augmentation = default_augmentation(FIXED.zero_sum(sweeps.format.window))
-        return cls(sweeps, run, settings, augmentation)
+        setup = cls(sweeps, run, settings, augmentation)
+        _ = setup.parts  # refused before the features are computed, which takes minutes
+        return setup
 
     @cached_property
     def copies(self) -> list[Dataset]:
