@@ -136,6 +136,15 @@ def test_groups_are_left_out():
 
 
 @pytest.mark.slow
+def test_a_bundle_scores_labels_that_are_numbers(tmp_path: Path):
+    """The fit takes them, so their bundle does; its own labels are texts."""
+    numbers = (LABELS == "wood").astype(int)
+    made = small().fit(SWEEPS[:36], numbers[:36], groups=GROUPS[:36])
+    made.save_bundle(tmp_path / "b", proven=False)
+    assert library.load_bundle(tmp_path / "b").score(SWEEPS[36:], numbers[36:]) >= 0.8
+
+
+@pytest.mark.slow
 def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path: Path):
     """save_bundle, library.load_bundle, predict; the card names the origin of the bundle."""
     # Words of the box's own refusals

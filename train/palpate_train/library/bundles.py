@@ -49,7 +49,7 @@ class BundleClassifier:
 
     def score(self, x: Any, y: Any) -> float:
         """The share of sweeps whose material the box names. y: a label for each sweep."""
-        return float(np.mean(self.predict(x) == np.asarray(y)))
+        return float(np.mean(self.predict(x) == np.asarray(y).astype(str)))
 
     def _sweeps(self, x: Any) -> Dataset:
         wanted = self.bundle.manifest.format
