@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,6 +22,24 @@ from palpate_train.data import pull, sets
 from palpate_train.metrics.score import Answers
 from palpate_train.models.recipe.fitted import Fit
 from tests.factories.sweep_sets import easy
+
+
+@pytest.mark.slow
+def test_the_next_commands_name_the_sweeps_of_the_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """They rename and select as the fit did; sweeps of a shorter window have no set."""
+    sweeps = easy(20)
+    sweeps.save(tmp_path / "easy.npz")
+    args = f"fit --set {tmp_path}/easy.npz --seed 1 --size bands --out {tmp_path}/fit.npz".split()
+    chosen = ["--rename", f"{sweeps.materials[0]}=first one", "--only", "speed<=2"]
+    assert main([*args, *chosen]) == 0
+    said = capsys.readouterr().out.partition("next:\n")[2].splitlines()
+    for line in said[:2]:
+        assert main(shlex.split(line)[1:]) == 0
+    assert "first one" in capsys.readouterr().out
+    assert all(shlex.join(chosen) in line for line in said[1:])
+    assert fit._next_commands(Path("a.npz"), [])[2:] == []
 
 
 @pytest.mark.slow

@@ -129,7 +129,8 @@ def run_fit(args: argparse.Namespace) -> None:
         say(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:
         say(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen")
-    say(*_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
+    judges = ["--set", str(args.rest)] if args.rest and rest else _judges(args)
+    say(*_next_commands(args.out, judges if args.rest or change == WHOLE else []))
 
 
 def _fit_method(args: argparse.Namespace, sweeps: Dataset) -> None:
@@ -138,20 +139,28 @@ def _fit_method(args: argparse.Namespace, sweeps: Dataset) -> None:
     _, made = MethodFit.of(method, sweeps, args.seed)
     made.save(args.out)
     say(f"fit: {made.about['method']} to {len(made.train)} sweeps; {args.out}")
-    say(*_next_commands(args.out, args.sets))
+    say(*_next_commands(args.out, _judges(args)))
+
+
+def _judges(args: argparse.Namespace) -> list[str]:
+    """The options that name the sweeps of this fit to another command."""
+    words = [word for one in args.sets for word in ("--set", one)]
+    words += [word for pair in args.rename for word in ("--rename", pair)]
+    return words + (["--only", *args.only] if args.only else [])
 
 
 def _next_commands(out: Path, judges: Sequence[str]) -> list[str]:
-    """The commands after a fit, as they can be pasted. judges: the sets to judge the bundle on."""
+    """The commands after a fit, as they can be pasted. judges: options that name the sweeps to
+    judge the bundle on; none where no set has its window."""
     folder = out.with_suffix("") if out.suffix else out.with_name(f"{out.name}-bundle")
-    sets = [word for one in judges for word in ("--set", one)]
     version = ["--name", folder.name, "--version", "1"]
     commands = (
         ["export", str(out), "--out", str(folder), *version],
-        ["score", str(folder), *sets],
-        ["report", str(out), *sets, "--out", str(out.with_suffix(".html"))],
+        ["score", str(folder), *judges],
+        ["report", str(out), *judges, "--out", str(out.with_suffix(".html"))],
     )
-    return ["next:", *(f"  palpate-train {shlex.join(words)}" for words in commands)]
+    able = commands if judges else commands[:1]
+    return ["next:", *(f"  palpate-train {shlex.join(words)}" for words in able)]
 
 
 def _check(args: argparse.Namespace) -> None:
