@@ -49,6 +49,7 @@ LETTERS = 74
 """Most letters of a line of small text."""
 KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships"
 FEW_KEY = "━ our family, from small to large   ◯ ships   ● int8   ■ float"
+ALONE = "│ time of features and network alone"
 FEW = (PACKAGED, OURS[0], "minirocket", "multirocket-hydra", "ds-cnn", "paper-cnn-centred", "quant")
 """The methods of README's picture; the page has all."""
 FEW_NAMES = {PACKAGED: "ships", OURS[0]: "Palpate"}
@@ -86,6 +87,7 @@ def speed(panels: Sequence[ChartPanel], machine: str, plain: bool = False) -> st
     said = ("" if plain else _below(panels), _gaps(panels, plain), machine)
     lines = [
         FEW_KEY if plain else KEY,
+        *[ALONE] * any(panel.answered for panel in panels),
         *(line for text in said for line in textwrap.wrap(text, LETTERS)),
     ]
     each, below = HEAD + HEIGHT + FOOT, 0.17 * len(lines) + 0.08
