@@ -51,7 +51,7 @@ def test_a_set_under_the_cap_is_used_whole(tmp_path: Path, monkeypatch: pytest.M
     """Its results do not change with the cap; without a number nothing is refused."""
     s = easy(4)
     assert len(recipe.Setup.of(s, Run(1), Settings()).sweeps) == len(s)
-    assert len(recipe.Setup.of(s, Run(1), Settings(most=6)).sweeps) == 6
+    assert len(recipe.Setup.of(s, Run(1), Settings(most=9)).sweeps) == 9
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
     monkeypatch.setattr(memory, "CGROUP", tmp_path / "none")
     memory.check(easy(4), 10**9)
