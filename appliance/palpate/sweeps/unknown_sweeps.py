@@ -13,8 +13,8 @@ from palpate.core.log import log
 from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 
-ALIKE = re.compile(r"; as sweep (\d{1,9})$")
-"""End of an answer's detail, with the number of an earlier sweep of the same run."""
+ALIKE = re.compile(r"; as sweep (\d{1,9})\b")
+"""Part of an answer's detail, with the number of an earlier sweep of the same run."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,8 @@ def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path, box):
     said = kept(folder, box, FELT[0], CORK[0], (0, 0), FELT[1], (60, -60), CORK[1], FELT[2])
     alike = [one.rpartition("; ")[2] for one in said if "; as" in one]
     assert alike == ["as sweep 1", "as sweep 2", "as sweep 1"]
+    humming = folder / "sweep-000004.json"  # the detail goes on
+    humming.write_text(humming.read_text().replace("as sweep 1", "as sweep 1; hum removed"))
     assert numbers(folder, box) == [[1, 4, 7], [2, 6]]
     again = Classifier(box.bundle, VirtualClock())
     kept(folder, again, *FELT)
