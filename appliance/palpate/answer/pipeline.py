@@ -73,10 +73,11 @@ class Context:
     full: share of its counts at full scale. degraded: the broken taxels that were bridged, None
     for none. hum: amplitude that was removed, in counts. disturbed: values of the disturbances by
     name. logits, embedding: [K], [r], of the network. far: float32 [K], of a contact in place: the
-    log of 1 + the squared distance to each label in units of the limit. probabilities: float64 [K],
-    of this sweep. own: the same, of a sweep that belongs to an object. scores: float64 [K], of all
-    `fused` sweeps of the object. after: as in Verdict. final: no further sweep of the object is
-    wanted. status, remark: of the answer.
+    log of 1 + the squared distance to each label in units of the limit. doubtful: the same in units
+    of the limit with disturbances, of a doubtful sweep that belongs to an object. probabilities:
+    float64 [K], of this sweep. own: the same, of a sweep that belongs to an object. scores: float64
+    [K], of all `fused` sweeps of the object. after: as in Verdict. final: no further sweep of the
+    object is wanted. status, remark: of the answer.
     """
 
     sweep: Sweep
@@ -95,6 +96,7 @@ class Context:
     logits: Array = field(default_factory=_none)
     embedding: Array = field(default_factory=_none)
     far: Array = field(default_factory=_none)
+    doubtful: Array = field(default_factory=_none)
     probabilities: NDArray[np.float64] = field(default_factory=_none)
     own: NDArray[np.float64] = field(default_factory=_none)
     scores: NDArray[np.float64] = field(default_factory=_none)

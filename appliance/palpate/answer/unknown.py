@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.contact import DisplacementRule
 from palpate.answer.disturbance import Disturbances
+from palpate.answer.objects import ObjectSweeps
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
 from palpate.core.schema import Positive, Within, check
@@ -187,7 +188,7 @@ class EarlyDistances:
 
 class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: of the means, [K].
-    strangers: the limit of `known` that applies. loose: the loose one, for the same embedding.
+    strangers: the limit of `known` that applies. strict, loose: these, for the same embedding.
 
     displacement: rule for sweeps whose contact is displaced. The distances are then computed in
     `classes.displaced`, where directions that a displacement changes have little weight, and all
@@ -218,8 +219,9 @@ class ClassDistances:
                 classes.displaced.means.astype(np.float64),
                 classes.displaced.turn.astype(np.float64),
             )
-        self.loose = self.limit * known.growth("loose")
-        self.limit *= known.growth(strangers)
+        self.strict, self.loose, self.limit = (
+            self.limit * known.growth(name) for name in ("strict", "loose", strangers)
+        )
         self._shapes = shapes.astype(np.float64)
         n = classes.sweeps
         # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1
@@ -312,12 +314,15 @@ class KnownMaterial:
     with the logits of the enrolled labels.
 
     displaced: for sweeps whose contact is displaced, None without a rule for them. Neither a
-    displacement nor a disturbance makes a material unknown. The latest sweeps of unknown materials
-    are kept, to notice a material that comes again.
+    displacement nor a disturbance makes a material unknown. Between the strict and the loose limit
+    a sweep is doubtful: two of an object are judged together. The latest sweeps of unknown
+    materials are kept, to notice a material that comes again.
     """
 
-    def __init__(self, means: ClassDistances, displaced: ClassDistances | None) -> None:
-        self._means, self._displaced = means, displaced
+    def __init__(
+        self, means: ClassDistances, displaced: ClassDistances | None, objects: ObjectSweeps
+    ) -> None:
+        self._means, self._displaced, self._objects = means, displaced, objects
         self._unknown: deque[tuple[int, NDArray[Any]]] = deque(maxlen=KEPT)
 
     def apply(self, context: Context) -> Refusal | None:
@@ -328,10 +333,17 @@ class KnownMaterial:
         context.logits = means.joined(context.logits, z)
         far, limit = means.measured(z, context.disturbed)
         if not off:
-            context.far = np.log1p(far / means.limit)
+            context.far, share = np.log1p(far / means.limit), limit / means.limit
+            doubtful = means.strict * share < far.min() <= means.loose * share
+            if doubtful and self._objects.fuses(context.sweep):
+                context.doubtful = np.log1p(far / limit)
+                both = self._objects.joined(context)
+                far = far if both is None else (np.expm1(both) * limit).astype(np.float32)
         k = int(far.argmin())
         if far[k] <= limit:
             return None
+        if len(context.doubtful):
+            self._objects.doubted(context.sweep, context.doubtful)
         novelty = {"distance": float(far[k]), "label": means.labels[k], "limit": limit}
         # a golden sweep has no number, and nobody touched it
         if not off and context.sweep.id and (alike := self._keep(context.sweep.id, z)):

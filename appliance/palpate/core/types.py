@@ -231,13 +231,14 @@ class Verdict:
     in Sweep. latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share:
     share of the window that was used, less than 1 in an early answer. own: float64 [K]
     probabilities of this sweep alone, before an enrolled label needs its least probability
-    (EnrolledLabels); empty if it has none. displacement: distance of
-    the contact from its positions in training ("moved 2.1 mm too far towards row 4"); None if it is
-    in place, or if the bundle does not have the positions. degraded: the broken taxels that were
-    bridged ("silent taxel 2.3"); None for none. after: number of the last sweep before
-    it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
-    measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
-    in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
+    (EnrolledLabels); empty if it has none. An unknown sweep has them if it is doubtful and belongs
+    to an object (KnownMaterial). displacement: distance of the contact from its positions in
+    training ("moved 2.1 mm too far towards row 4"); None if it is in place, or if the bundle does
+    not have the positions. degraded: the broken taxels that were bridged ("silent taxel 2.3"); None
+    for none. after: number of the last sweep before it that had probabilities, since NEW OBJECT; 0
+    for none. speed_mm_s, force_n: as in Sweep. measured_mm_s: speed of the slide, measured from the
+    window; None if that was not possible, and in early answers. direction: one of
+    `directions.DIRECTIONS`; None without a measured speed.
     """
 
     sweep: int

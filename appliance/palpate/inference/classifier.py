@@ -69,8 +69,8 @@ class Classifier(Observer):
     or `max_sweeps` were fused (undecided, the final answer).
 
     If the contact is displaced and the bundle has a rule for displacement, the rule's distances,
-    limit, temperature and least probability apply. An unknown sweep is not fused: it has no
-    probabilities, and one touch next to the object must not invalidate the other sweeps.
+    limit, temperature and least probability apply. An unknown sweep is not fused: one touch next to
+    the object must not invalidate the other sweeps.
 
     settings: a min_probability of 0 becomes the bundle's thresholds.unsure. slides: whether answers
     have the speed of the slide; without it they take less time. model: of a classifier with the
@@ -109,7 +109,7 @@ class Classifier(Observer):
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
             displaced = class_distances(bundle, settings.strangers, displaced=True)
-            network.append(KnownMaterial(self._means, displaced))
+            network.append(KnownMaterial(self._means, displaced, self._objects))
         self._stages = self.stages(*network)
 
     def stages(self, *network: Stage) -> list[Stage]:
@@ -278,6 +278,10 @@ class Classifier(Observer):
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
         self._objects.present = FusedSweeps()
+
+    def after(self, sweep: Sweep) -> int:
+        """Number of the last sweep of the same object that had probabilities, 0 for none."""
+        return self._objects.earlier(sweep).last
 
     def verdict(self, context: Context) -> Verdict:
         """The verdict on a judged sweep."""

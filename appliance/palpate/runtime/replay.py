@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,11 @@ from palpate.runtime.loop import Box
 from palpate.sweeps.capture import Playback
 from palpate.sweeps.sweep_folder import RecordedSweep, number_of
 from palpate.sweeps.sweep_window import SweepCutter
+from palpate.sweeps.unknown_sweeps import ALIKE
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
-sweep are the same, but earlier sweeps of its object are missing."""
+sweep are the same, but earlier sweeps of its object, or one that it resembles, are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
 LATEST = 500
 """Number of the latest sweeps that a new release must answer as before."""
@@ -143,8 +144,6 @@ class SweepReplay:
         self._clock = ReplayClock()
         self._classifier: Classifier | None = None
         self._made: object = None  # folder, run and rule of the classifier
-        # (object, number) of the last sweep with probabilities whose earlier sweeps are all there
-        self._last: object = None
 
     def __call__(self, kept: KeptSweep) -> ReplayResult:
         """The verdict on `kept`, compared with its sidecar's. Raises FormatError."""
@@ -156,17 +155,15 @@ class SweepReplay:
         _check(f"sweep {kept.sweep.id}", kept.format, self._bundle)
         _check_length(kept.sweep, kept.format)
         was = kept.verdict
-        fused = was.get("fused", 0)
-        after = was.get("after", 0)
-        whole = after <= 0 or self._last == (kept.object, after)
-        if (fused or was.get("own")) and (whole or fused == 1):
-            self._last = kept.object, kept.sweep.id
         classifier = self._prepared(kept)
+        whole = was.get("after", 0) in (0, classifier.after(kept.sweep))
         if not whole:
             classifier.forget()
-        sweep = kept.sweep if whole or fused == 1 else replace(kept.sweep, object=0)
-        verdict, own = _answered(classifier, sweep)
+        verdict, own = _answered(classifier, kept.sweep)
         if not whole:
+            # what follows depends on the missing sweeps, too, unless another object began here
+            if not (verdict and verdict.fused == was.get("fused") == 1):
+                classifier.forget()
             outcome = ALONE if own.tolist() == was.get("own") else DIFFERENT
             return ReplayResult(verdict, outcome, "earlier sweeps of its object are not there")
         if verdict is None:
@@ -175,8 +172,9 @@ class SweepReplay:
         if not (was and kept.bundle):  # recorded without a bundle
             return ReplayResult(verdict, SILENT)
         now = verdict.as_dict()
-        changed = [_change(name, was[name], now.get(name)) for name in was]
-        text = ", ".join(filter(None, changed))
+        text = _changes(was, now)
+        if text and not _changes(_unlike_any(was), _unlike_any(now)):
+            return ReplayResult(verdict, ALONE, "the sweep that it resembles is not there")
         return ReplayResult(verdict, DIFFERENT if text else SAME, text)
 
     def _prepared(self, kept: KeptSweep) -> Classifier:
@@ -192,10 +190,17 @@ class SweepReplay:
         return self._classifier
 
 
-def _change(name: str, was: object, now: object) -> str:
-    if was == now:
-        return ""
-    return f"other {name}" if isinstance(was, list) else f"{name} {was!r} is now {now!r}"
+def _changes(was: dict[str, Any], now: dict[str, Any]) -> str:
+    return ", ".join(
+        f"other {name}" if isinstance(value, list) else f"{name} {value!r} is now {now.get(name)!r}"
+        for name, value in was.items()
+        if value != now.get(name)
+    )
+
+
+def _unlike_any(verdict: dict[str, Any]) -> dict[str, Any]:
+    """The verdict as if the material had not been met before."""
+    return verdict | {"detail": ALIKE.sub("", str(verdict.get("detail")))}
 
 
 def _print(path: Path, found: ReplayResult, out: Callable[[str], object]) -> str:

@@ -28,6 +28,7 @@ A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 """Embeddings of a sure "a", a sure "b", and an "a" with a probability of .65."""
 BELOW, ASIDE = (0.0, -2.9), (0.0, 2.9)
 """A sure "a" that is far from "c", and an "a" with a probability of .57 between them."""
+SAME_SHAPES = np.stack([np.eye(1)] * 3).astype(np.float16)
 S = 1_000_000_000
 ANOTHER = "another object: "
 DELIVERED = ClassifierConfig()
@@ -129,6 +130,109 @@ def test_a_sweep_that_lies_elsewhere_is_not_made_surer(toy, conflict, given):
             assert [it(one).fused for one in felt(BELOW, between)] == [1, 2]
         it.judged(sweeps[1], told(it, np.array([0.9, 0.1, 0.0])))
         assert it(sweeps[2]).fused == 4
+
+
+NEAR, BEYOND, FAR, ELSEWHERE = (0.0, -2.4), (0.0, -3.4), (0.0, -4.4), (-3.0, 3.0)
+"""Squared distances of 5.8, 11.6 and 19.4 to "a", and of 18 on its other side."""
+WIDE = replace(toy_bundle.KNOWN, strict=4.0, loose=25.0)
+
+
+@pytest.fixture
+def doubting(tmp_path: Path) -> Bundle:
+    """The toy bundle, in which sweeps with squared distances between 4 and 25 are doubtful."""
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays() | {"shapes": SAME_SHAPES})
+    rules = {"displacement": toy_bundle.DISPLACEMENT, "contact": toy_bundle.IN_PLACE}
+    return toy_bundle.load(tmp_path / "doubting", arrays=arrays, known=WIDE, **rules)
+
+
+def last(it: Classifier, sweeps: Iterable[Sweep]) -> str:
+    """Label of the last sweep, "" for an unknown material."""
+    *_, verdict = [it(sweep) for sweep in sweeps]
+    assert (verdict.status is Status.UNKNOWN) == (not verdict.label)
+    return verdict.label
+
+
+@pytest.mark.parametrize("fuse", ["product", "vote"])
+def test_two_doubtful_sweeps_are_judged_together(doubting, fuse):
+    """By the mean of the logarithms, within the limit or beyond it; a clear one alone."""
+    for first, second, alone, label in (
+        (NEAR, NEAR, "a", "a"),
+        (NEAR, BEYOND, "", "a"),
+        (BEYOND, NEAR, "a", "a"),
+        (FAR, NEAR, "a", ""),
+        (NEAR, FAR, "", ""),
+        ((0.0, -4.1), (0.0, -2.0), "a", "a"),
+        ((0.0, -5.1), (0.0, -2.9), "a", "a"),
+    ):
+        assert last(classifier(doubting, fuse=fuse), felt(second)) == alone
+        assert last(classifier(doubting, fuse=fuse), felt(first, second)) == label
+    first, second = map(classifier(doubting), felt(FAR, NEAR))
+    mean = np.sqrt((1 + 19.36 / 9) * (1 + 5.76 / 9)) - 1
+    assert f"squared distance {9 * mean:.4g} from a, limit 9" in second.detail
+    assert (second.after, len(second.own), len(second.scores)) == (1, 3, 0)
+    assert (first.after, len(first.own), len(first.scores)) == (0, 3, 0)
+    single = classifier(doubting)(replace(felt(FAR)[0], object=0))
+    assert (len(single.own), single.detail) == (0, first.detail)
+
+
+@pytest.mark.parametrize(("conflict", "label"), [("new", "a"), ("refuse", "a"), ("fuse", "")])
+def test_doubtful_sweeps_that_are_not_alike_are_two_objects(doubting, conflict, label):
+    """Unless only NEW OBJECT ends an object."""
+    assert last(classifier(doubting, conflict=conflict), felt(ELSEWHERE, NEAR)) == label
+
+
+def test_doubt_ends_with_its_object(doubting):
+    """By NEW OBJECT, a pause, max_sweeps, and a sweep that is clear, displaced or early."""
+    far, near = felt(FAR, NEAR)
+    it = classifier(doubting)
+    assert last(it, [far, near]) == ""
+    assert last(it, [replace(far, object=2), replace(near, object=3)]) == "a"
+    for more in ({"object_s": 6.0}, {"fuse": "none"}):
+        assert last(classifier(doubting, **more), [far, near]) == "a"
+    assert last(classifier(doubting), [replace(one, object=0) for one in (far, near)]) == "a"
+    for most, label in ((1, ""), (2, "a")):
+        assert last(classifier(doubting, max_sweeps=most), felt(NEAR, BEYOND)) == label
+    assert last(classifier(doubting), felt(FAR, A, NEAR)) == "a"
+    assert last(classifier(doubting), felt(FAR, (30.0, 30.0), NEAR)) == ""
+    sweeps = felt(FAR, A, NEAR)
+    sweeps[1].frames.taxels[:, 1] -= 80  # displaced
+    assert last(classifier(doubting), sweeps) == "a"
+    sweeps[2] = replace(toy_bundle.sweep(0.0, -1.8), id=3, object=1)
+    sweeps[2].frames.taxels[:, 1] -= 80  # displaced, and doubtful by the limits of these
+    assert last(classifier(doubting, conflict="fuse"), sweeps[::2]) == "a"
+    it, sweeps = classifier(doubting), felt(FAR, A, NEAR)
+    it(sweeps[0])
+    it.unfinished(sweeps[1], told(it, np.array([0.9, 0.1, 0.0])))
+    assert last(it, sweeps[2:]) == "a"
+
+
+def test_an_unknown_sweep_leaves_the_evidence(doubting):
+    """A doubtful one between others is neither fused nor compared, nor does it delay a pause."""
+    it = classifier(doubting, object_s=8.0)
+    given = [it(one) for one in felt(A, FAR, A, pause_s=5)]
+    assert [(v.fused, v.after) for v in given] == [(1, 0), (0, 1), (1, 2)]
+    it = classifier(doubting, object_s=20.0)
+    given = [it(one) for one in felt(A, FAR, A, pause_s=5)]
+    assert [(v.fused, v.after) for v in given] == [(1, 0), (0, 1), (2, 2)]
+
+
+def test_checks_leave_no_doubt(doubting):
+    """Golden sweeps, which are doubtful here, are joined with none and part none."""
+    it, (far, near) = classifier(doubting), felt(FAR, NEAR)
+    it(far)
+    it.rehearse()
+    assert it.refusals() == [Status.OK, Status.OK]
+    assert last(it, [near]) == ""
+
+
+@pytest.mark.parametrize(
+    ("strangers", "label"), [("strict", ""), ("balanced", "a"), ("loose", "a")]
+)
+def test_doubtful_sweeps_are_compared_with_the_limit_that_applies(doubting, strangers, label):
+    """The strict one makes none known; the loose one refuses none of them."""
+    assert last(classifier(doubting, strangers=strangers), felt(NEAR, BEYOND)) == label
+    alone = last(classifier(doubting, strangers=strangers), felt(BEYOND))
+    assert alone == ("a" if strangers == "loose" else "")
 
 
 def test_an_unsure_sweep_is_fused(toy):

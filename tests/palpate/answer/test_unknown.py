@@ -28,6 +28,7 @@ CHANGES = np.float16([[[0, -20], [0, -20], [0, -40]], [[0, 0], [0, 0], [0, 0]]])
 """Lost frames move the second direction, "c" twice as far; hum moves nothing."""
 ALLOWED = Disturbances((Allowance("lost", 0.0, 0.25, 2.0), Allowance("hum", 0.0, 3.0, 1.0)), 4.0)
 RULE = Early((0.6, 0.6, 0.6), 2, (4.0, 4.0, 4.0))
+WIDE = replace(toy_bundle.KNOWN, strict=4.0, loose=25.0)
 HUMMING = SweepFormat(2, 2, 750.0, 1500, "int16")
 HUM = 5 * np.sin(2 * np.pi * 50 * np.arange(1500)[:, None, None] / 750)
 
@@ -164,6 +165,22 @@ def test_a_disturbance_ends_no_object(tmp_path):
     it = Classifier(disturbed(tmp_path, wide, arrays=arrays), VirtualClock(), ClassifierConfig())
     first, second = toy_bundle.sweep(0, 0, 1, 1), replace(lost(0, 0), id=2, object=1)
     assert [it(first).fused, it(second).fused] == [1, 2]
+
+
+def test_a_disturbed_sweep_is_doubtful_within_its_own_limits(tmp_path):
+    """They are 1.4 times as far with a fifth of the frames lost."""
+    arrays, known = {"changes": np.zeros((2, 3, 2), np.float16)}, WIDE
+    given = disturbed(tmp_path, arrays=arrays, known=known)
+
+    def joined(first: Sweep, second: Sweep) -> str:
+        it = Classifier(given, VirtualClock())
+        it(replace(first, object=1))
+        return it(replace(second, id=2, object=1)).label
+
+    assert joined(toy_bundle.sweep(0, -4.4), toy_bundle.sweep(0, -2.2)) == ""
+    assert joined(toy_bundle.sweep(0, -4.4), lost(0, -2.2)) == "a"
+    assert joined(toy_bundle.sweep(0, -2.8), lost(0, -3.4)) == "a"
+    assert joined(toy_bundle.sweep(0, -2.8), toy_bundle.sweep(0, -3.4)) == ""
 
 
 def test_displaced_sweeps_are_allowed_the_same(tmp_path):

@@ -218,6 +218,40 @@ def test_objects_end_in_a_replay_as_they_did(tmp_path, toy, conflict):
             assert counted(outcomes) == [(15, "sweeps"), (14, "same"), (1, "itself")]
 
 
+@pytest.mark.parametrize(
+    "conflict", ["new", *(pytest.param(one, marks=pytest.mark.slow) for one in ("refuse", "fuse"))]
+)
+def test_sweeps_that_are_judged_together_are_replayed_so(tmp_path, conflict):
+    """Doubtful sweeps (n: known alone, f: not), known and unknown ones. With any sweep missing none
+    is called different, and one that was judged with it is compared by itself."""
+    rule = ClassifierConfig(max_sweeps=4, conflict=conflict)
+    wide = replace(toy_bundle.KNOWN, strict=4.0, loose=25.0)
+    model = toy_bundle.load(tmp_path / "bundle", known=wide)
+    it, folder = Classifier(model, rig.VirtualClock(), rule), tmp_path / "kept"
+    folder.mkdir()
+    places = {"a": (0, 0), "b": (6, 0), "n": (0, -2.4), "m": (0, -3.4), "f": (0, -4.4)}
+    # y is known by x alone, and begins another object after b and e
+    places |= {"e": (4.3, 0), "x": (2.5, 0), "y": (1.7, -2.6)}
+    answers, number = [], 0
+    for n, letters in enumerate(("fn", "nm", "mnmaf", "afn", "bmn", "anfnm", "bexyn"), 1):
+        for letter in letters:
+            number += 1
+            sweep = toy_bundle.sweep(*places[letter], number=number, object=n)
+            sweep = replace(sweep, start_ns=number * 10**10, stop_ns=number * 10**10 + 1)
+            answers.append(it(sweep))
+            keep(folder, it, sweep, answers[-1])
+    assert [one.label for one in answers[:4]] == ["", "", "a", "a"]
+    code, _, outcomes = played(folder, model)
+    assert (code, counted(outcomes)[1:]) == (0, [(number, "same")])
+    for missing in folder.glob("*.npy"):
+        rest = Path(shutil.copytree(folder, tmp_path / missing.stem))
+        (rest / missing.name).unlink()
+        code, _, outcomes = played(rest, model)
+        assert code == 0, outcomes
+        needed = any(v.after == int(missing.stem[-6:]) for v in answers)
+        assert any("sweeps of its object" in line for line in outcomes) == needed
+
+
 def test_every_difference_is_told(in_service, default_bundle):
     """A score one bit off, another label or tare: exit code 1."""
     folder, _ = in_service
