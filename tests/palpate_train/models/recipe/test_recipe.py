@@ -367,6 +367,20 @@ def test_only_named_conditions_judge():
 
 
 @pytest.mark.slow
+def test_a_condition_whose_value_holds_all_other_materials_judges_no_answers():
+    """A second day with one material alone: the limits come of the other conditions, or else of
+    recordings."""
+    sweeps = varied()
+    day = (sweeps.labels == 0) & (np.arange(len(sweeps)) % 2 == 0)
+    sweeps = replace(sweeps, groups=sweeps.groups | {"day": day.astype(int)})
+    assert "day" in {part.group for part in inner_parts(sweeps)}
+    for varies, conditions in (((), ["force", "batch", "tool"]), (("day",), ["recording"])):
+        made = recipe.fit(sweeps, Run(1), replace(CLOSED, varies=varies))
+        assert made.about["conditions"] == conditions
+        assert made.calibration, made.uncalibrated
+
+
+@pytest.mark.slow
 def test_a_condition_that_cannot_be_left_out_is_refused():
     """The error names it."""
     for name in ("recording ", "speed"):

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate_train.answer import embedding
 from palpate_train.answer.heads import HeadData, HeadPlan, condition_values
 from palpate_train.data import extras
 from palpate_train.data.augment import (
@@ -162,11 +163,13 @@ class Setup:
 
     @cached_property
     def conditions(self) -> tuple[str, ...]:
-        """The groups that can be left out, the hardest first: that whose sweeps the usual heads
-        classify worst if they have not seen its value. Groups of two values come last: without one
-        of them, heads learn nothing of how the other varies."""
-        if len(self.left_out) < 2:
-            return self.left_out
+        """The groups of which each value can be left out, the hardest first: that whose sweeps the
+        usual heads classify worst if they have not seen its value. Groups of two values come last:
+        without one of them, heads learn nothing of how the other varies. Without any, recordings.
+        """
+        left_out = tuple(filter(self._judges, self.left_out)) or ("recording",)
+        if len(left_out) < 2:
+            return left_out
         scores = self.held_out_scores
         right = scores.right(scores.score(candidates(self.fixed, self).usual()))
 
@@ -174,7 +177,13 @@ class Setup:
             of = scores.own & (scores.groups == name)
             return len(np.unique(self.sweeps.group(name))) < 3, float(right[of].mean())
 
-        return tuple(sorted(self.left_out, key=order))
+        return tuple(sorted(left_out, key=order))
+
+    def _judges(self, name: str) -> bool:
+        """Whether two materials remain without any value of a group, to judge its sweeps by."""
+        _, values = np.unique(self.sweeps.group(name), return_inverse=True)
+        rests = [self.sweeps.labels[rest] for rest, _ in embedding.parts(values, values >= 0)]
+        return all(len(np.unique(rest)) > 1 for rest in rests)
 
     @cached_property
     def judging(self) -> InnerPart:
