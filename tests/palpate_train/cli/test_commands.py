@@ -16,6 +16,7 @@ import pytest
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import FormatError
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.cli import bundles, fit
 from palpate_train.cli.main import PROGRAM, main
 from palpate_train.data import pull, sets
@@ -310,6 +311,20 @@ def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureF
     told = [line for line in capsys.readouterr().out.splitlines() if "expect less" in line]
     (line,) = told
     assert "direction" in line
+
+
+@pytest.mark.slow
+def test_a_fit_teaches_no_sweep_of_other_things(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Sweeps that a box has recorded as `not this` move the limits, which fit and export tell."""
+    source, made = str(tmp_path / "set.npz"), str(tmp_path / "fit.npz")
+    sweeps = easy(40)
+    replace(sweeps, materials=(*sweeps.materials[:2], NOT_THIS)).save(tmp_path / "set.npz")
+    assert main(["fit", "--set", source, "--seed", "1", "--size", "bands", "--out", made]) == 0
+    assert f"of 40 sweeps of {NOT_THIS!r}" in capsys.readouterr().out
+    out = ["--out", str(tmp_path / "bundle"), "--name", "b", "--version", "1"]
+    assert main(["export", made, *out]) == 0
+    assert f"of 40 sweeps of {NOT_THIS!r}" in capsys.readouterr().out
+    assert bundle.load(tmp_path / "bundle").manifest.labels == sweeps.materials[:2]
 
 
 @pytest.mark.parametrize(

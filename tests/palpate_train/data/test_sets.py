@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.data import sets
 from tests.factories.sweep_sets import easy, held, write
 
@@ -221,6 +222,18 @@ def test_split_is_the_seed_s_alone_and_trains_on_each_material():
         except FormatError as e:
             outcomes.add("lacks 'high'" if "'high'" in str(e) else str(e))
     assert outcomes == {2, "lacks 'high'"}
+
+
+def test_sweeps_of_other_things_are_taught_apart():
+    """Sweeps of `not this` are no material; two others must remain."""
+    s = easy(8)
+    assert s.taught() == (s, None)
+    named, others = replace(s, materials=("low", NOT_THIS, "high")).taught()
+    assert named.materials == ("low", "high")
+    np.testing.assert_array_equal(named.labels, s.labels[s.labels != 1] // 2)
+    np.testing.assert_array_equal(others, s.samples[s.labels == 1])
+    with pytest.raises(FormatError, match="'low'"):
+        replace(s, materials=("low", NOT_THIS, "high")).take(s.labels < 2).taught()
 
 
 def test_split_refuses_what_would_flatter():

@@ -15,6 +15,7 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate.core.outputs import Row, add_rows
 from palpate.core.storage import put
+from palpate.core.sweep_set import Array
 from palpate.core.text import say
 from palpate_train.answer import stranger_limits
 from palpate_train.arguments import numbers, options, scene_file
@@ -102,14 +103,15 @@ def run_fit(args: argparse.Namespace) -> None:
         words = [*scene_file.words(args.scene, args.parser), *args.words[1:]]
         args = argparse.Namespace(**vars(args.parser.parse_args(words)) | {"words": args.words})
     _check(args)
-    sweeps, rest = labels.check(options.load(args, args.seed)), None
+    sweeps, strangers = labels.check(options.load(args, args.seed)).taught()
+    rest = None
     if args.split:
         sweeps, rest = sweeps.split(*options.group_share(args.split), args.seed)
     if args.method:
         _fit_method(args, sweeps)
         return
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
-    made, change, unfinished = _fitted(args, sweeps)
+    made, change, unfinished = _fitted(args, sweeps, strangers)
     if args.rest and rest:
         change.of(rest).save(args.rest)
         made = replace(made, about=made.about | {"rest": str(args.rest)})
@@ -186,7 +188,9 @@ def _check(args: argparse.Namespace) -> None:
             options.writable_file(path, f"--{option}", *endings)
 
 
-def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path | None]:
+def _fitted(
+    args: argparse.Namespace, sweeps: Dataset, strangers: Array | None
+) -> tuple[Fit, Change, Path | None]:
     """The fit for these options, the reduction of its sweeps, and the folder that keeps the
     training of stages until the fit is written."""
     use = SkinUse(args.reattached, float(args.mains))
@@ -198,6 +202,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
         use=use,
         varies=args.varies,
         most=args.most_sweeps,
+        strangers=strangers,
     )
     wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
     if any(wish):

@@ -21,6 +21,7 @@ from palpate.core import storage, sweep_set
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.sim import skin
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.data import group_values, mapped, readers
 from palpate_train.data.files.table import normal
 from palpate_train.data.group_values import text_of
@@ -85,6 +86,18 @@ class Dataset(sweep_set.SweepSet):
             keep &= self._matches(text)
         if not keep.any():
             raise self._error(f"no sweep fulfils {' and '.join(conditions)}; use fewer conditions")
+        return self._only(keep)
+
+    def taught(self) -> tuple[Dataset, Array | None]:
+        """The sweeps of materials that an answer may name, and the samples of the others, which are
+        of NOT_THIS; None without any. Raises FormatError if fewer than two materials remain."""
+        named = np.array(self.materials)[self.labels] != NOT_THIS
+        if named.all():
+            return self, None
+        return self._only(named), mapped.taken(self.samples, ~named)
+
+    def _only(self, keep: Array) -> Dataset:
+        """The sweeps `keep` (bool [N]), without materials that no longer occur."""
         part = (self if keep.all() else self.take(keep)).require_materials()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))

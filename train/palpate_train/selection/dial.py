@@ -187,9 +187,9 @@ class Judgement:
 
     def reduced(self, name: str) -> Settings:
         """The settings for a fit of this size to reduced sweeps: stages only if the size has them
-        for the whole ones."""
+        for the whole ones, and no strangers, which are whole."""
         steps = self.setup.settings.steps if self.sizes[name].trunk else 0
-        return replace(self.setup.settings, size=FAMILY[name], steps=steps)
+        return replace(self.setup.settings, size=FAMILY[name], steps=steps, strangers=None)
 
     @property
     def staged(self) -> bool:

@@ -40,9 +40,8 @@ def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    settings = recipe.Settings(most=len(lesson.sweeps), displaced=False)
+    settings = recipe.Settings(most=len(lesson.sweeps), displaced=False, strangers=lesson.strangers)
     setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
-    setup = replace(setup, strangers=lesson.strangers)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
     parts, scores, chosen = setup.parts, choice.scores, choice.chosen

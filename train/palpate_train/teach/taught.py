@@ -43,8 +43,8 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings(displaced=False))
-    setup = replace(setup, strangers=lesson.strangers)
+    settings = recipe.Settings(displaced=False, strangers=lesson.strangers)
+    setup = recipe.Setup.of(sweeps, Run(0), settings)
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")

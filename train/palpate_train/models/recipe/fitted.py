@@ -79,7 +79,7 @@ class Fit:
     again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
     do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
     given: inputs of the calibration, kept for export if it knows other things than materials; not
-    in the file, nor are strangers: raw counts [n, T, ...] of materials that were not taught.
+    in the file. strangers: raw counts [n, T, ...] of materials that were not taught.
     """
 
     weights: dict[str, Array]
@@ -182,6 +182,7 @@ class Fit:
         arrays |= {f"weight_{k}": v for k, v in self.weights.items()}
         for kind, part in (("calibration", self.calibration), ("contacts", self.contacts)):
             arrays |= {f"{kind}_{k}": v for k, v in (part.arrays() if part else {}).items()}
+        arrays |= {} if self.strangers is None else {"strangers": self.strangers}
         meta |= {
             "scale": self.scale,
             "architecture": asdict(self.architecture),
@@ -232,6 +233,7 @@ class Fit:
             calibration=meta["calibration"] and Calibration.of(calibration, meta["calibration"]),
             uncalibrated=meta["uncalibrated"],
             contacts=meta["contacts"] and Contacts.read(contacts, meta["contacts"]),
+            strangers=arrays.get("strangers"),
         )
 
 

@@ -93,7 +93,7 @@ class Settings:
     calibration and contacts, which a bundle needs and `evaluate` does not. displaced: whether
     displaced contacts are calibrated; they need the distance between taxels. varies: the groups
     that will have other values in service; without any, all that can be left out. most: largest
-    number of sweeps that are used; of more, some are drawn, see sets.thinned.
+    number of sweeps that are used; of more, some are drawn, see sets.thinned. strangers: as in Fit.
     """
 
     steps: int = 0
@@ -103,18 +103,17 @@ class Settings:
     displaced: bool = True
     varies: tuple[str, ...] = ()
     most: int = MOST_SWEEPS
+    strangers: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that the steps of a fit share, each part computed when it is first needed.
-    strangers: as in Fit."""
+    """Everything that the steps of a fit share, each part computed when it is first needed."""
 
     sweeps: Dataset
     run: Run
     settings: Settings
     augmentation: Augmentation
-    strangers: Array | None = None
 
     @classmethod
     def of(cls, sweeps: Dataset, run: Run, settings: Settings) -> Setup:
@@ -407,7 +406,7 @@ def finish(stages: Trunk | None, judged: HeadChoice, setup: Setup) -> Fit:
         {**trunk.weights, **heads},
         *(trunk.scale, trunk.architecture, trunk.ranges, *setup.sides, about),
         plan=plan.uncooled(),
-        strangers=setup.strangers,
+        strangers=settings.strangers,
     )
     if not settings.calibrate:
         return made
