@@ -26,6 +26,8 @@ UNPROVEN = "broken taxels are refused: export it again to measure how many can b
 """Text of a bundle without `bridging`."""
 UNCHECKED = "early answers do not detect unknown materials: export it again"
 """Text of a bundle with early answers, but without limits for them."""
+UNLIMITED = "unknown materials get the label of a known one, as classifier.strangers has no limits"
+"""Text of a bundle that does not detect unknown materials."""
 UNALLOWED = "noise, hum or another speed look like an unknown material: export it again"
 """Text of a bundle that detects unknown materials, but has no allowances for disturbances."""
 LISTEN_S, LONGEST_S, LEAST_FRAMES = 1.0, 5.0, 50
@@ -83,6 +85,7 @@ def _described(bundle: Bundle) -> str:
         + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
         + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
         + (f"; {UNALLOWED}" if m.known and not m.disturbances else "")
+        + ("" if m.known else f"; {UNLIMITED}")
     )
 
 

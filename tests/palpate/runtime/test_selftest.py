@@ -15,6 +15,7 @@ from palpate.core.clock import Clock
 from palpate.io import skin_profile
 from palpate.runtime import selftest
 from palpate.sim import devices, rig, script
+from palpate_train.answer import fit_unknown
 from tests.factories.skins import devices as played
 from tests.factories.skins import sweeps
 
@@ -64,6 +65,13 @@ def test_check_says_what_the_bundle_allows(default_bundle, component, changes, p
     assert part in found.detail
     if component == "bundle":
         assert ("material" in found.detail) == ("disturbances" in changes)
+
+
+def test_check_says_that_unknown_materials_get_a_label(default_bundle):
+    """Only of a bundle without limits, for which classifier.strangers chooses nothing."""
+    limitless = fit_unknown.without(default_bundle)
+    for model in (default_bundle, limitless):
+        assert (selftest.UNLIMITED in results_of(model)["bundle"].detail) == (model is limitless)
 
 
 @pytest.mark.slow

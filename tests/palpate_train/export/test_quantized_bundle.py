@@ -27,6 +27,7 @@ from palpate.core.types import SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import skin
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_studies import cost, references
 from palpate_train.answer import rules, stranger_limits
 from palpate_train.answer.heads import HeadData
@@ -35,7 +36,7 @@ from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
-from palpate_train.export import contents, pack, quantized_bundle
+from palpate_train.export import card, contents, pack, quantized_bundle
 from palpate_train.export.contents import ExportRefused
 from palpate_train.metrics import bundle_score, tolerances
 from palpate_train.metrics.score import REFUSED
@@ -523,6 +524,41 @@ def test_the_command_exports_what_fit_wrote(
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
     assert "golden.npz" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_the_figures_of_a_bundle_agree(few: bool, tmp_path: Path):
+    """The held-out sweeps that are not unknown are as many as the line says, at the limit that is
+    exported, whatever was fitted before; sweeps of other things change no shape."""
+    fit = recipe.fit(close(40), Run(1), recipe.Settings())
+    if few:
+        strangers = np.roll(close(40).samples[:2], 1, axis=2)
+        fit = finished(replace(fit, strangers=strangers))
+        fit.save(tmp_path / "fit.npz")
+        fit = Fit.load(tmp_path / "fit.npz")
+    made = export(
+        replace(fit, about=fit.about | {stranger_limits.COST: 1e-6}), tmp_path / "b", proven=False
+    )
+    told, held = made.figures[stranger_limits.FIGURES], made.figures["held-out recording"]
+    assert held["unknown"] == round((1 - told["balanced"]["answered"][0]) * held["n"])
+    assert held["unknown"] < fit.held_out_figures()["held-out recording"]["unknown"]
+    assert told.get(NOT_THIS) == (2 if few else None)
+    assert made.disturbances
+
+
+def test_a_bundle_that_names_everything_says_so(
+    fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Neither a share of unknown materials nor an `unknown` sweep is promised without the limit."""
+    fitted.save(tmp_path / "fit.npz")
+    args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
+    assert main(["export", str(tmp_path / "fit.npz"), *args, "--without", "unknown"]) == 0
+    printed, made = capsys.readouterr().out, bundle.load(tmp_path / "bundle").manifest
+    assert card.UNLIMITED in printed
+    assert "did not teach" not in printed
+    assert stranger_limits.FIGURES not in made.figures
+    assert made.figures["held-out speed"]["unknown"] == 0
+    assert card.UNLIMITED in (tmp_path / "bundle" / card.NAME).read_text()
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):

@@ -32,7 +32,7 @@ from palpate_train.arguments import numbers, options
 from palpate_train.arguments.options import above_zero, path, text
 from palpate_train.arguments.program import Add
 from palpate_train.data import repeats, sets
-from palpate_train.export import measure, pack, quantized_bundle
+from palpate_train.export import card, measure, pack, quantized_bundle
 from palpate_train.metrics import bundle_score
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.recipe.fitted import WHAT, Fit
@@ -156,6 +156,8 @@ def _print(manifest: Manifest, out: Path) -> None:
     say(*stranger_limits.lines(manifest.figures))
     if manifest.known:
         say(*altered_sweeps.text(manifest.figures).split("\n"))
+    else:
+        say(card.UNLIMITED)
     for part in (quantized_bundle, fit_early, fit_contact, fit_slide, rules):
         if text := part.text(manifest):
             say(*text.split("\n"))

@@ -314,7 +314,8 @@ def _print_held_out(made: Fit) -> None:
     if made.calibration:
         say(*formatting.figure_lines(figures := made.held_out_figures()))
         say(*_worst(made))
-        say(*stranger_limits.lines(figures))
+        if cost := stranger_limits.lines(figures):
+            say(*cost, "export prints these again, for limits that also know altered sweeps")
         if len(conditions) > 1:
             mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
             share = formatting.percent(mean / len(conditions))

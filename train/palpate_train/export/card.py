@@ -17,6 +17,7 @@ from palpate_train.data.sets import Dataset, digest
 
 NAME = "card.md"
 NOT_STATED = "not stated"
+UNLIMITED = "unknown materials: not noticed, each gets the label of a known one"
 Json = dict[str, Any]
 
 
@@ -102,7 +103,7 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
                 lines += [f'- `classifier.strangers = "{limit}"`: {"; ".join(cost)}']
         lines += ["", altered_sweeps.text(manifest.figures), ""]
     else:
-        lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
+        lines += [UNLIMITED, ""]
     if manifest.format.dtype == "float32":
         lines += [
             "The box refuses a sweep with a count that is NaN or infinite. `model.onnx` alone, in "

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle.bundle import Bundle, Manifest
+from palpate.sweeps.sweep_folder import NOT_THIS
 from palpate_train.answer import (
     altered_sweeps,
     calibrate,
@@ -32,7 +33,6 @@ from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_early import EarlyRule
 from palpate_train.answer.rules import RULES, Asked
-from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.export import trial
 from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.contents import Content
@@ -57,17 +57,16 @@ def from_features(
     if not (fit.contacts and fit.contacts.positions(pitch_mm)):
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule
-    figures = fit.held_out_figures()
     trunk, prefixes = fit.trunk(), fit.trunk(prefixes=True) if rule.early else None
     given = fit.given or calibration_inputs(fit)
     apart = _unseen(given, calibration)
-    few = given.junk or altered_sweeps.few(fit.held)
+    few = bool(given.junk.keys() - {NOT_THIS}) or altered_sweeps.few(fit.held)
     found = None if few else _widened(fit, apart.embedding, calibration.embedding)
     classes = [apart.classes(), calibration.classes()]
-    beyond = _limits(found, given, calibration.embedding, fit)
+    judged = _limited(found, given, calibration, fit, "unknown" not in left_out)
+    beyond, figures = judged.limits, replace(fit, calibration=judged).held_out_figures()
     early = {"lost": rule.lost, "n": rule.n} if rule.early else rule.why
     content = replace(content, known=beyond.known(calibration.class_mean_temperature))
-    figures |= {stranger_limits.FIGURES: beyond.figures}
     if found:
         content = replace(content, disturbances=found.disturbances)
         wider = zip(classes, found.shapes, found.changes, strict=True)
@@ -83,7 +82,10 @@ def from_features(
         about=content.about | {"early": early},
         figures=content.figures | figures,
     )
-    return _early_checked(content)
+    content = _early_checked(content)
+    if "unknown" in left_out:
+        content.figures.pop(stranger_limits.FIGURES)
+    return content
 
 
 def _early_checked(content: Content) -> Content:
@@ -99,20 +101,29 @@ def _early_checked(content: Content) -> Content:
     )
 
 
-def _limits(
+def _limited(
     found: altered_sweeps.Widened | None,
     given: CalibrationInputs,
-    whole: Embedding,
+    calibration: Calibration,
     fit: Fit,
-) -> StrangerLimits:
-    """The limits of known materials, for the widened shapes if there are any."""
+    applied: bool,
+) -> Calibration:
+    """`calibration` with the limits of known materials, for the widened shapes if there are any,
+    and with the held-out sweeps that are within them; all are if the limits are not `applied`."""
+    whole = calibration.embedding
     if found:
         distances = altered_sweeps.left_out_in_turn(found, given, whole)
         whole = replace(whole, shapes=found.shapes[1])
     else:
         distances = calibrate.left_out_in_turn(given, whole)
     cost, junk = fit.about.get(stranger_limits.COST, 1.0), calibrate.junk_distances(given, whole)
-    return stranger_limits.limits(distances, cost, junk)
+    beyond = stranger_limits.limits(distances, cost, junk)
+    most = np.log(beyond.balanced) if applied else np.inf
+    held = {
+        name: replace(of, known=distances[name].corrected()[0][of.numbers] <= most)
+        for name, of in calibration.held.items()
+    }
+    return replace(calibration, limits=beyond, held=held)
 
 
 def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:
