@@ -225,7 +225,7 @@ def test_split_is_the_seed_s_alone_and_trains_on_each_material():
 
 
 def test_sweeps_of_other_things_are_taught_apart():
-    """Sweeps of `not this` are no material; two others must remain."""
+    """The material `not this` is dropped; two others must remain."""
     s = easy(8)
     assert s.taught() == (s, None)
     named, others = replace(s, materials=("low", NOT_THIS, "high")).taught()
