@@ -83,7 +83,7 @@ FIXED = Architecture((), planned=len(STAGES.channels))
 """A trunk without stages that prepares counts as a trunk with STAGES does."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Settings:
     """The settings of a fit.
 
