@@ -253,6 +253,9 @@ def test_each_condition_has_its_curve(figures: dict):
     assert "new speed" in two
     assert all(of.count(f">{limit}<") == 1 for of in (one, two) for limit in COSTS)
     assert two.count("<use") - one.count("<use") == len(COSTS)
+    hard = shares | {"balanced": [[0.37, 0.2]]}
+    assert ">40<" not in two
+    assert ">40<" in bundle_report.strangers(found | {"by condition": {"a": shares, "b": hard}})
 
 
 @pytest.mark.slow

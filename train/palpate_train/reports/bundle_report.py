@@ -33,8 +33,8 @@ Json = Mapping[str, Any]
 MOST_IN_MATRIX = 12
 """Number of labels up to which the confusion matrix can be read on a phone. With more labels there
 is only the table."""
-NAME = 0.09, 0.1
-"""Width and height of the name of a limit, in the units of its picture."""
+NAME = 0.18, 0.1
+"""Width and height of the name of a limit, as shares of the axes of its picture."""
 QUARTERS = [0, 0.25, 0.5, 0.75, 1]
 ANSWERS = "answered", "named"
 LINES = ["-", "--", ":", "-."]
@@ -253,27 +253,31 @@ def curve(points: Sequence[Json]) -> str:
 def strangers(found: Json) -> str:
     """Share of unknown sweeps with a label over the share of known sweeps that are answered, a line
     for each condition with the points of the three limits. found: figures of stranger_limits."""
-    figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.2, bottom=0.5)
+    figure, axes = single_axes(2.6, left=0.14, right=0.95, top=0.2, bottom=0.5)
     shares = {limit: [[found[limit][of][0] for of in ANSWERS]] for limit in stranger_limits.COSTS}
     total = {" or ".join(found["under"]): {"curve": found["curve"]} | shares}
     each = found.get("by condition") or total
+    drawn = [pair for of in each.values() for limit in of for pair in of[limit]]
+    left = min(stranger_limits.LEAST_KEPT["strict"], int(10 * min(x for x, _ in drawn)) / 10)
     highest = max(each, key=lambda condition: each[condition]["balanced"][0][1])
     for k, (style, (condition, of)) in enumerate(zip(cycle(LINES), each.items(), strict=False)):
         line: dict[str, Any] = {"color": ACCENT, "linewidth": 2, "linestyle": style}
         axes.plot(*np.transpose(of["curve"]), **line)
-        axes.plot([0.515, 0.55], [0.97 - 0.12 * k] * 2, **line)
-        write(axes, 0.56, 0.94 - 0.12 * k, f"new {condition}", GREY, SMALL, ha="left")
+        key = [left + (1 - left) * share for share in (0.03, 0.1, 0.12)]
+        axes.plot(key[:2], [0.97 - 0.12 * k] * 2, **line)
+        write(axes, key[2], 0.94 - 0.12 * k, f"new {condition}", GREY, SMALL, ha="left")
         points = sorted((*of[limit][0], limit) for limit in stranger_limits.COSTS)
         at_x, at_y = 0.0, 0.0
         for x, y, limit in points:
             axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
             if condition == highest:
-                meets = x - at_x < NAME[0] and abs(y + 0.05 - at_y) < NAME[1]
+                meets = x - at_x < NAME[0] * (1 - left) and abs(y + 0.05 - at_y) < NAME[1]
                 at_x, at_y = x, at_y + NAME[1] if meets else y + 0.05
                 write(axes, x, at_y, limit, GREY, SMALL, ha="right")
-    axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
+    axes.set_xlim(left, 1.005)
     axes.set_ylim(0, 1.05)
-    set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)
+    ticks = np.arange(10, 10 * left - 0.5, -1 if left > 0.3 else -2)[::-1] / 10
+    set_ticks(axes.xaxis, ticks, percent=True)
     _shares(axes, "known sweeps answered", "unknown ones with a label")
     return to_svg(figure, "unknown sweeps with a label over known sweeps answered")
 
