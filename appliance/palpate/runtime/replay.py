@@ -114,13 +114,15 @@ def _rule(held: Any) -> ClassifierConfig:
     return typed(ClassifierConfig, held)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ReplayResult:
-    """The result for a kept sweep. verdict: None if the replay gives no verdict."""
+    """The result for a kept sweep. verdict: None if the replay gives no verdict. alone: its own
+    probabilities, if earlier sweeps of its object are missing: its status says nothing then."""
 
     verdict: Verdict | None
     outcome: str
     detail: str = ""
+    alone: NDArray[np.float64] | None = None
 
 
 class ReplayClock:
@@ -165,7 +167,7 @@ class SweepReplay:
             if not (verdict and verdict.fused == was.get("fused") == 1):
                 classifier.forget()
             outcome = ALONE if own.tolist() == was.get("own") else DIFFERENT
-            return ReplayResult(verdict, outcome, "earlier sweeps of its object are not there")
+            return ReplayResult(verdict, outcome, "earlier sweeps of its object are not there", own)
         if verdict is None:
             why = "it was answered early, which this bundle does not do"
             return ReplayResult(verdict, DIFFERENT, why)
@@ -255,7 +257,7 @@ def changed(folder: Path, settings: Config, bundle: Bundle, run: int = 0) -> tup
         except FormatError:  # of another bundle, or damaged: it says nothing about the program
             continue
         count += result.outcome != SILENT
-        if result.outcome == DIFFERENT and (why := _beyond(kept.verdict, result.verdict)):
+        if result.outcome == DIFFERENT and (why := _beyond(kept.verdict, result)):
             found.append(f"{path.name}: {why}")
         if result.verdict and (shift := _shift(kept.verdict, result.verdict)) > MOST_SHIFT:
             shifted.append(f"{path.name}: its probabilities differ by {100 * shift:.0f} %")
@@ -273,16 +275,23 @@ def main(argv: Sequence[str]) -> int:
     return OTHERWISE if found else 0
 
 
-def _beyond(was: dict[str, Any], now: Verdict | None) -> str:
+def _beyond(was: dict[str, Any], found: ReplayResult) -> str:
     """The change of an answer if it is larger than the tolerance, else ""."""
-    if now is None:
-        return "it is not answered any more"
-    before, own = np.asarray(was.get("own", []), np.float64), now.own
-    near = before.shape == own.shape and np.allclose(before, own, 0, GOLDEN_TOLERANCE)
-    # near a limit, "ok" may become "unsure" within the tolerance
-    if near and (was.get("status") == now.status or {was.get("status"), now.status} <= CLASSIFIED):
+    now, own = found.verdict, found.alone
+    if own is None:
+        if now is None:
+            return "it is not answered any more"
+        own = now.own
+    before = np.asarray(was.get("own", []), np.float64)
+    same = before.shape == own.shape and np.allclose(before, own, 0, GOLDEN_TOLERANCE)
+    if found.alone is None:
+        statuses = {was.get("status"), now and now.status}
+        # near a limit, "ok" may become "unsure", and an unknown sweep may have no probabilities
+        same = same and (len(statuses) == 1 or statuses <= CLASSIFIED)
+        same = same or (statuses == {Status.UNKNOWN} and not (len(before) and len(own)))
+    if same:
         return ""
-    return f"it was {_said(was)}, and is {_said(now.as_dict())}"
+    return f"it was {_said(was)}, and is {_said(now.as_dict()) if now else 'not answered'}"
 
 
 def _shift(was: dict[str, Any], now: Verdict) -> float:

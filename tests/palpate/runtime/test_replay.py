@@ -295,6 +295,41 @@ def test_a_release_that_answers_otherwise_is_found_by_the_kept_sweeps(
     assert main([*asked[:2], str(SWEEPS)]) == 0
 
 
+def test_a_release_is_not_blamed_for_sweeps_that_are_missing(tmp_path):
+    """Nor for a last bit with them: a sweep that was unknown, another object's, or answered early
+    by them alone. Other probabilities are found, and an unknown sweep that has none any more is
+    not."""
+    wide = replace(toy_bundle.KNOWN, strict=4.0, loose=25.0)
+    heads = {"early": Early((0.5,) * 3, 1), "outputs": ("logits", "embedding", "early")}
+    model = toy_bundle.load(tmp_path / "bundle", known=wide, **heads)
+    rule = ClassifierConfig(conflict="refuse", min_probability=0.97)
+    it, folder = Classifier(model, rig.VirtualClock(), rule), tmp_path / "kept"
+    folder.mkdir()
+    places = ((0, -4.4), (0, -2.4)), ((0, 0), (6, 0)), ((2.5, 0.5), (2.5, 0.5)), ((0, 0), (0, -4.4))
+    statuses = []
+    for number, (x, y) in enumerate((one for both in places for one in both), 1):
+        sweep = toy_bundle.sweep(x, y, number=number, object=(number + 1) // 2)
+        if number == 6:
+            frames = toy_bundle.frames_of(sweep.frames.taxels[:10])
+            sweep = replace(sweep, frames=frames, share=0.5)
+        verdict = EarlyExit(it)(sweep) if sweep.share < 1 else it(sweep)
+        statuses.append(str(verdict.status))
+        keep(folder, it, sweep, verdict)
+    given = "unknown, unknown, ok, conflict, unsure, ok, ok, unknown"
+    assert ", ".join(statuses) == given
+    change(at(folder, 8), verdict=sidecar(at(folder, 8))["verdict"] | {"own": []})
+    assert changed(folder, HERE, model) == (8, [])
+    for n in (2, 4, 6):
+        at(folder, n - 1).unlink()
+        one_bit_off(at(folder, n), "own")
+    assert changed(folder, HERE, model) == (5, [])
+    for n in (2, 4, 6):
+        change(at(folder, n), verdict=sidecar(at(folder, n))["verdict"] | {"own": [0.1, 0.8, 0.1]})
+    count, found = changed(folder, HERE, model)
+    assert count == 5
+    assert [one[:13] for one in found] == ["sweep-000002.", "sweep-000004.", "sweep-000006."]
+
+
 def test_a_release_that_shifts_most_sweeps_a_little_is_found(
     in_service, default_bundle, monkeypatch
 ):
