@@ -335,7 +335,8 @@ class KnownMaterial:
         if not off:
             context.far, share = np.log1p(far / means.limit), limit / means.limit
             doubtful = means.strict * share < far.min() <= means.loose * share
-            if doubtful and self._objects.fuses(context.sweep):
+            numbers = doubtful and bool(np.isfinite(context.logits).all())
+            if numbers and self._objects.fuses(context.sweep):
                 context.doubtful = np.log1p(far / limit)
                 both = self._objects.joined(context)
                 far = far if both is None else (np.expm1(both) * limit).astype(np.float32)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from palpate.answer.objects import FusedSweeps, contradicts, softmax
+from palpate.answer.unknown import KnownMaterial
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import UNTIL_NEW_OBJECT, ClassifierConfig
 from palpate.core.status import LEAST_PROBABILITY
@@ -214,6 +215,18 @@ def test_an_unknown_sweep_leaves_the_evidence(doubting):
     it = classifier(doubting, object_s=20.0)
     given = [it(one) for one in felt(A, FAR, A, pause_s=5)]
     assert [(v.fused, v.after) for v in given] == [(1, 0), (0, 1), (2, 2)]
+
+
+@pytest.mark.parametrize("given", [np.nan, np.inf, 0.0])
+def test_a_sweep_without_numbers_is_not_doubtful(doubting, given):
+    """It is unknown as by itself: its answer has no probabilities, and it is joined with none."""
+    it, (far, near) = classifier(doubting), felt(FAR, NEAR)
+    at = next(i for i, stage in enumerate(it._stages) if isinstance(stage, KnownMaterial))
+    stages = [*it._stages[:at], toy_bundle.GivenAnswer(np.array([given, 1, 1])), *it._stages[at:]]
+    verdict = it.verdict(it.judged(far, stages))
+    assert (verdict.status, verdict.own.tolist(), verdict.after) == (Status.UNKNOWN, [], 0)
+    verdict = it(near)
+    assert (verdict.label, verdict.after) == ("a", 0)
 
 
 def test_checks_leave_no_doubt(doubting):
