@@ -200,8 +200,9 @@ class ObjectSweeps:
             None if conflict else before,
         )
         now = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns, context.far)
-        doubtful = replace(now, far=context.doubtful) if len(context.doubtful) else None
-        self.present = replace(now, doubtful=doubtful)
+        if len(context.doubtful):  # replace() takes time
+            now = replace(now, doubtful=replace(now, far=context.doubtful))
+        self.present = now
         fused = kept.probabilities
         context.scores = fused if votes else self.enrolled.decided(fused)
         context.fused, context.remark = kept.sweeps, conflict

@@ -332,15 +332,16 @@ class KnownMaterial:
         z = context.embedding
         context.logits = means.joined(context.logits, z)
         far, limit = means.measured(z, context.disturbed)
+        k = int(far.argmin())
         if not off:
             context.far, share = np.log1p(far / means.limit), limit / means.limit
-            doubtful = means.strict * share < far.min() <= means.loose * share
-            numbers = doubtful and bool(np.isfinite(context.logits).all())
+            doubtful = means.strict * share < far[k] <= means.loose * share
+            numbers = doubtful and np.isfinite(context.logits).all()
             if numbers and self._objects.fuses(context.sweep):
                 context.doubtful = np.log1p(far / limit)
-                both = self._objects.joined(context)
-                far = far if both is None else (np.expm1(both) * limit).astype(np.float32)
-        k = int(far.argmin())
+                if (both := self._objects.joined(context)) is not None:
+                    far = (np.expm1(both) * limit).astype(np.float32)
+                    k = int(far.argmin())
         if far[k] <= limit:
             return None
         if len(context.doubtful):
