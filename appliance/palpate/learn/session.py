@@ -38,9 +38,11 @@ of a process that only assesses the sweeps."""
 
 
 def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
-    """Raises ConfigError for a label that the delivered bundle was trained on, and for sweeps that
-    would move its limits."""
+    """Raises ConfigError for a label that the delivered bundle was trained on, for sweeps that
+    would move its limits, and for a material whose label looks like NOT_THIS."""
     trained, labels = tuple(trained), tuple(labels)
+    if alike := [name for name in labels if name != NOT_THIS and name.lower() == NOT_THIS]:
+        raise ConfigError(f"{alike[0]!r} would be taught as a material; write {NOT_THIS!r}")
     if trained and NOT_THIS in labels:
         raise ConfigError(
             f"a delivered bundle keeps its limits, and {NOT_THIS!r} cannot move them; set "

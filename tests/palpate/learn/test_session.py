@@ -263,6 +263,15 @@ def test_a_delivered_bundle_keeps_its_limits():
     session.refuse_trained((), [NOT_THIS])
 
 
+def test_another_spelling_of_something_else_is_no_material(taught):
+    """A box that answers `ok, Not this` would mislead; neither a first sweep nor a new name."""
+    taught.sweeps("cork", 1)
+    for order in (("TEACH", "Not this"), ("MATERIAL", "NOT THIS"), ("RENAME", "cork,Not This")):
+        with pytest.raises(ApplianceError, match="write 'not this'"):
+            taught.order(*order)
+    assert taught.order("TEACH", NOT_THIS) == [NOT_THIS, 0]
+
+
 def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     """By TEACH; or at the start, until one is forgotten."""
     narrow = Taught(tmp_path, codes=4)
