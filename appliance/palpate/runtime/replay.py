@@ -158,8 +158,8 @@ class SweepReplay:
         _check_length(kept.sweep, kept.format)
         was = kept.verdict
         classifier = self._prepared(kept)
-        whole = was.get("after", 0) in (0, classifier.after(kept.sweep))
-        if not whole:
+        whole = (after := was.get("after", 0)) in (0, classifier.after(kept.sweep))
+        if not whole or (not after and was.get("own")):  # this replay may have other sweeps before
             classifier.forget()
         verdict, own = _answered(classifier, kept.sweep)
         if not whole:

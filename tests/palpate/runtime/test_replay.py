@@ -252,6 +252,17 @@ def test_sweeps_that_are_judged_together_are_replayed_so(tmp_path, conflict):
         assert any("sweeps of its object" in line for line in outcomes) == needed
 
 
+def test_a_difference_is_told_once(tmp_path, toy):
+    """Not of the next sweep of the object, too, which was the first that had probabilities."""
+    it = Classifier(toy, rig.VirtualClock(), replace(UNTIL_NEW_OBJECT, min_probability=0.9))
+    first, second = (toy_bundle.sweep(2.5, 0.5, number=n, object=1) for n in (1, 2))
+    failed = Verdict.of(first, Status.FAILED, 0, toy.id, detail="no memory")
+    for sweep, verdict in ((first, failed), (second, it(second))):
+        keep(tmp_path, it, sweep, verdict)
+    code, _, outcomes = played(tmp_path, toy)
+    assert (code, outcomes[-1]) == (1, "2 sweeps: 1 DIFFERENT, 1 the same")
+
+
 def test_every_difference_is_told(in_service, default_bundle):
     """A score one bit off, another label or tare: exit code 1."""
     folder, _ = in_service
