@@ -130,7 +130,8 @@ def test_distances_of_zero_and_the_nearest_other_mean():
 
 def test_the_user_reads_both_shares():
     """A line for known sweeps with the condition, a line for the others, each with its number of
-    sweeps; a guess is called one."""
+    sweeps, which count once for all conditions; how much one material differs from another; a guess
+    is called one."""
     guess = left_out()
     few = replace(guess, labels=guess.labels % 2)
     for sweeps, guessed in ((guess, False), (few, True)):
@@ -140,6 +141,13 @@ def test_the_user_reads_both_shares():
         assert "new force" in known
         assert f"of {np.isfinite(sweeps.strangers).sum()} sweeps" in strangers
         assert ("guess" in strangers) == guessed
+    near = replace(guess, strangers=np.where(guess.labels == 1, 1e-3, guess.strangers))
+    figures = limits({"force": near, "speed": near}).figures
+    least, most = figures["balanced"]["of one"]
+    assert least < figures["balanced"]["named"][0] < most == 1
+    assert figures["known"] == figures["strangers"] == len(guess.labels)
+    told = stranger_limits.lines({stranger_limits.FIGURES: figures})[1]
+    assert f", of one material {100 * least:.0f} to 100 %" in told
     assert stranger_limits.lines({}) == []
 
 
@@ -164,7 +172,9 @@ def test_other_things_between_known_and_unknown_materials_narrow_a_limit(name: s
 
 
 def test_each_condition_has_a_curve_with_three_points():
-    """Both shares rise along it; a condition that scatters more lets fewer known sweeps pass."""
+    """Both shares rise along it; a condition that scatters more lets fewer known sweeps pass. A
+    single one has them too."""
+    assert limits({"force": left_out()}).figures["by condition"].keys() == {"force"}
     found = limits({"force": left_out(400), "speed": left_out(400, inflated=1.0, parts=20)})
     by_condition = found.figures["by condition"]
     assert by_condition.keys() == {"force", "speed"}

@@ -100,8 +100,9 @@ class StrangerLimits:
     """strict, balanced, loose: the limits. figures: for a manifest, JSON: `under`, the conditions;
     `known` and `strangers`, numbers of sweeps; `guess`, whether too few materials were left out;
     for each limit the shares of known sweeps that are `answered` and of unknown ones that are
-    `named`, with their intervals; `curve`, the two shares for limits from the lowest to the highest
-    that may be chosen; of several conditions `by condition`, the two at these and at each limit."""
+    `named`, with their intervals, and `of one`, the least and the largest share of one unknown
+    material; `curve`, the two shares for limits from the lowest to the highest that may be chosen;
+    `by condition`, the two at these and at each limit."""
 
     strict: float
     balanced: float
@@ -135,6 +136,11 @@ class _Sweeps:
         """The share within a limit, and its interval."""
         right = self.logs <= np.log(limit)
         return [round(float(right.mean()), 4), *interval(right, self.clusters)]
+
+    def of_one(self, limit: float) -> list[float]:
+        """The least and the largest share of a material within a limit."""
+        shares = [round(float(np.mean(of <= np.log(limit))), 4) for of in self.by_material]
+        return [min(shares), max(shares)]
 
 
 def limits(
@@ -179,15 +185,15 @@ def limits(
     spread = np.linspace(np.argmax(kept >= LEAST_KEPT["strict"]), most, DRAWN).round().astype(int)
     figures: dict[str, Any] = {
         "under": list(left_out),
-        "known": len(known.logs),
-        "strangers": len(strangers.logs),
+        "known": _sweeps(one.known for one in left_out.values()),
+        "strangers": _sweeps(one.strangers for one in left_out.values()),
         "guess": len(known.by_material) <= FEW,
         "curve": np.round(np.stack([kept, named], 1)[spread], 4).tolist(),
     } | _by_condition(left_out, grid[spread], chosen)
     for name, limit in chosen.items():
         figures[name] = {"answered": known.within(limit)}
         if len(strangers.logs):
-            figures[name]["named"] = strangers.within(limit)
+            figures[name] |= {"named": strangers.within(limit), "of one": strangers.of_one(limit)}
         for logs in own:
             figures[NOT_THIS] = len(logs)
             figures[name][NOT_THIS] = round(float(np.mean(logs <= np.log(limit))), 4)
@@ -204,14 +210,20 @@ def _least_of_few(materials: int, junk: bool) -> float:
 def _by_condition(
     left_out: Mapping[str, LeftOut], curve: Array, chosen: Mapping[str, float]
 ) -> dict[str, Any]:
-    """The figures of each of several conditions. curve: logarithms of limits."""
+    """The figures of each condition. curve: logarithms of limits."""
     drawn = {"curve": curve, **{name: np.log([of]) for name, of in chosen.items()}}
     judged = {
         name: {what: _shares(one, at) for what, at in drawn.items()}
         for name, one in left_out.items()
         if np.isfinite(one.known).any() and np.isfinite(one.strangers).any()
     }
-    return {"by condition": judged} if len(judged) > 1 else {}
+    return {"by condition": judged}
+
+
+def _sweeps(distances: Iterable[Array]) -> int:
+    """The number of sweeps that judge under one condition at least."""
+    judged: Array = np.any([np.isfinite(of) for of in distances], axis=0)
+    return int(judged.sum())
 
 
 def _shares(one: LeftOut, logs: Array) -> list[list[float]]:
@@ -294,7 +306,9 @@ def lines(figures: Mapping[str, Any], limit: str = "balanced") -> list[str]:
     if named := shares.get("named"):
         guess = " (a guess: few materials were left out)" if found["guess"] else ""
         foreign = f"of {found['strangers']} sweeps of materials that you did not teach"
-        told.append(f"{foreign} {_percent(named)} get a label{guess}")
+        of_one = [f"{100 * of:.0f}" for of in shares.get("of one", ())]
+        each = f", of one material {' to '.join(of_one)} %" if of_one else ""
+        told.append(f"{foreign} {_percent(named)} get a label{each}{guess}")
     if own := found.get(NOT_THIS):
         share = 100 * shares[NOT_THIS]
         told.append(f"of {own} sweeps of {NOT_THIS!r} {share:.0f} % get a label")
