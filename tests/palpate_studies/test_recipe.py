@@ -65,7 +65,7 @@ def test_each_set_is_fitted_once(monkeypatch: pytest.MonkeyPatch):
 def test_views_are_read_from_the_trunk_and_needed():
     """Each part of an architecture is one; the table needs the cost of each."""
     assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
-    every = Architecture((4,), 8, 2, 0, True, POOLS, True, True, 3)
+    every = Architecture((4,), 8, 2, 0, True, POOLS, True, True, 3, True)
     assert recipe_views.views_of(every) == list(tables.VIEWS)
     with pytest.raises(KeyError, match="stages"):
         tables.recipe({"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []})

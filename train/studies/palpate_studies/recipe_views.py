@@ -89,6 +89,7 @@ def alone(sweeps: Dataset) -> Mapping[str, Trunk]:
         "few relations": replace(plain, relations=relations.SHORT),
         "relations": replace(plain, relations=every.architecture.relations),
         "loads": replace(plain, loads=True),
+        "slow waves": replace(plain, slow=True),
     }
     trunks = {
         name: replace(every, weights=filters, architecture=architecture)
@@ -139,6 +140,7 @@ def views_of(architecture: Architecture) -> list[str]:
         "spectrum": architecture.spectrum,
         "relations": architecture.relations > 0,
         "loads": architecture.loads,
+        "slow waves": architecture.slow,
         "stages": len(architecture.channels) > 0,
     }
     return [name for name, has in there.items() if has]
