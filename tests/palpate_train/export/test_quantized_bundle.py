@@ -577,12 +577,19 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     assert re.match(r"int8 loses .*record more", other.made["float_because"])
 
 
-def test_any_method_is_judged_by_the_same_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """An int8 method's figures are in its bundle; beyond a limit it is refused."""
+def test_any_method_is_judged_by_the_same_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """An int8 method's figures are in its bundle; beyond a limit it is refused. It has no limits
+    that a cost could set."""
     (method,) = methods.find(["palpate-64"])
     _, made = MethodFit.of(method, close(), 1)
     made.save(tmp_path / "fit.npz")
     read = MethodFit.read("fit.npz", sweep_set.read(tmp_path / "fit.npz", "a fit"))
+    words = f"export {tmp_path}/fit.npz --out {tmp_path}/b --name a --version 1 --stranger-cost 2"
+    assert main(words.split()) == 65
+    assert "--stranger-cost 2" in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()
     manifest = export(read, tmp_path / "b", "close")
     assert manifest.figures["parity"]["total"] == len(made.held)
     assert quantized_bundle.text(manifest).startswith("int8 against float: ")

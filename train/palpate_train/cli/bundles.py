@@ -58,7 +58,7 @@ _EXPORT: tuple[Row, ...] = (
     _rules("--without", "left_out", "leave these rules out"),
     ("--licence", "of the recordings, for card.md: CC-BY-4.0", text("NAME", "")),
     above_zero("--stranger-cost", "N", "cost of an unknown material that gets a"
-        " label, as a multiple of the cost of a known one without a label (1)", default=1.0),
+        " label, as a multiple of the cost of a known one without a label (1)"),
 )
 # fmt: on
 
@@ -82,7 +82,12 @@ def run_export(args: argparse.Namespace) -> None:
     made = kind.read(args.fit.name, arrays)
     made.about[pack.LICENCE] = args.licence
     if isinstance(made, Fit):
-        made.about[stranger_limits.COST] = args.stranger_cost
+        made.about[stranger_limits.COST] = args.stranger_cost or 1.0
+    elif args.stranger_cost:
+        raise FormatError(
+            f"--stranger-cost {args.stranger_cost:g}: {args.fit} is of another method, which gives "
+            "each unknown material a label; leave it out, or fit without --method"
+        )
     manifest = quantized_bundle.export(
         made,
         args.out,
