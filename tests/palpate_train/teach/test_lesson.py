@@ -56,9 +56,12 @@ def test_what_can_be_taught_and_judged(tmp_path: Path):
 
 
 def test_sweeps_of_something_else_are_no_material(tmp_path: Path):
-    """They are kept beside the materials, and are not judged."""
+    """They are kept beside the materials, and are not judged. One of another skin is counted."""
     sweeps(tmp_path, "a", NOT_THIS, "b", "a", "b", NOT_THIS)
+    other = SweepFormat(2, 3, 50.0, 9, "int16")
+    record(tmp_path / "sweep-000007.npy", NOT_THIS, format=other, frames=9)
     lesson = Lesson.read(tmp_path).repeated()
+    assert dict(lesson.left_out) == {"another format": 1}
     assert lesson.sweeps.materials == ("a", "b")
     assert len(lesson.names) == 4
     assert lesson.strangers is not None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.slide_check import SlidesAmong
 from palpate.core.errors import FormatError
+from palpate.core.types import SweepFormat
 from palpate.sweeps.sweep_folder import (
     NOT_THIS,
     NoSlide,
@@ -52,12 +53,14 @@ class Lesson:
         sent."""
         readers.check_folder(folder)
         left_out: Counter[str] = Counter()
-        every = list(taught(folder, left_out))
-        kept = [one for one in every if one.sweep.material != NOT_THIS]
-        if not kept:
+        of_both: tuple[list[RecordedSweep], list[RecordedSweep]] = [], []
+        for one in taught(folder, left_out):
+            of_both[one.sweep.material == NOT_THIS].append(one)
+        if not of_both[0]:
             why = f" ({readers.counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
-        kept = _of_one_format(kept, left_out)
+        wanted = of_both[0][-1].format
+        kept, others = (_of_format(wanted, sweeps, left_out) for sweeps in of_both)
         check = SlidesAmong(kept[0].format)
         slides, unchecked = check.among(
             (one.sweep.frames.taxels for one in kept), [one.sweep.material for one in kept]
@@ -66,12 +69,7 @@ class Lesson:
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = readers.from_recorded(readers.named(kept, NOWHERE), folder, Dataset)
         names = tuple(one.path.stem for one in kept)
-        others = [
-            one.sweep.frames.taxels
-            for one in every
-            if one.sweep.material == NOT_THIS and one.format == sweeps.format
-        ]
-        strangers = np.stack(others) if others else None
+        strangers = np.stack([one.sweep.frames.taxels for one in others]) if others else None
         return cls(labels.check(sweeps), names, left_out, no_slides, unchecked, strangers)
 
     @property
@@ -100,10 +98,10 @@ class Lesson:
         return replace(self, sweeps=part, names=names)
 
 
-def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> list[RecordedSweep]:
-    """The sweeps of the format of the last one."""
-    wanted = kept[-1].format
-    same = [one for one in kept if one.format == wanted]
-    if len(same) < len(kept):
-        left_out["another format"] = len(kept) - len(same)
+def _of_format(
+    wanted: SweepFormat, sweeps: Sequence[RecordedSweep], left_out: Counter[str]
+) -> list[RecordedSweep]:
+    """The sweeps of this format; the others are counted."""
+    same = [one for one in sweeps if one.format == wanted]
+    left_out += Counter({"another format": len(sweeps) - len(same)})
     return same
