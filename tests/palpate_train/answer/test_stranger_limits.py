@@ -72,7 +72,7 @@ def test_a_cross_fit_is_corrected_for_what_it_lacks(parts: int):
 
 @pytest.mark.parametrize(
     ("n", "materials", "least", "most"),
-    [(160, 4, 0.65, 0.8), (400, 4, 0.45, 0.6), (120, 3, 0.85, 0.95)],
+    [(160, 4, 0.65, 0.8), (400, 4, 0.45, 0.6), (120, 3, 0.85, 0.95), (400, 2, 0.85, 0.95)],
 )
 def test_known_sweeps_are_kept_at_any_cost(n: int, materials: int, least: float, most: float):
     """Half at a million times the cost, more of few sweeps, most of few materials; nearly all where

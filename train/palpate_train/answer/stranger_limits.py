@@ -44,8 +44,9 @@ FEW_SWEEPS, LEAST_OF_FEW, LEAST_OF_GUESS, LEAST_BY_JUNK = 50, 0.7, 0.9, 0.85
 too little of strangers to give up more known sweeps for them, and their cross-fits are farther away
 than new sweeps of the finished model. Of .5 to .95, .7 had the least cost on nine simulated sets.
 Up to FEW materials say still less; with .7 three materials of 20 sweeps lost 15 to 18 points of
-known sweeps for 11 to 19 of unknown ones (simulated). With junk made of up to ten sweeps, .7 would
-answer 6 to 12 points less at a new place."""
+known sweeps for 11 to 19 of unknown ones (simulated). With two, one alone is left to compare: it
+holds for any number of sweeps (trials/0006). With junk made of up to ten sweeps, .7 would answer 6
+to 12 points less at a new place."""
 FEW_STRANGERS = 3
 """This number of sweeps of NOT_THIS counts half as much as many do: a single one may be a slip."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
@@ -175,9 +176,8 @@ def limits(
     own = [_log(junk[NOT_THIS])] if NOT_THIS in junk else []
     weight = (counted := sum(map(len, own))) / (counted + FEW_STRANGERS)
     wrong = named + _share_below(grid, made) + weight * _share_below(grid, own)
-    most, chosen, least_kept = int(np.argmax(kept >= KEPT)), {}, dict(LEAST_KEPT)
-    if len(known.logs) <= FEW_SWEEPS * len(known.by_material) * len(left_out):
-        least_kept["balanced"] = _least_of_few(len(known.by_material), bool(made))
+    most, chosen = int(np.argmax(kept >= KEPT)), {}
+    least_kept = LEAST_KEPT | _least_of_few(known, len(left_out), bool(made))
     for name, cost in COSTS.items():
         cheapest = _cheapest(kept, wrong, stranger_cost * cost)
         least = int(np.argmax(kept >= least_kept[name]))
@@ -200,11 +200,15 @@ def limits(
     return StrangerLimits(**chosen, figures=figures)
 
 
-def _least_of_few(materials: int, junk: bool) -> float:
-    """The least share of known sweeps that the balanced limit of few sweeps keeps."""
+def _least_of_few(known: _Sweeps, conditions: int, junk: bool) -> dict[str, float]:
+    """The least share of known sweeps that the balanced limit keeps of few sweeps, or of two
+    materials, by its name; nothing of more."""
+    materials = len(known.by_material)
+    if materials >= FEW and len(known.logs) > FEW_SWEEPS * materials * conditions:
+        return {}
     if junk:
-        return LEAST_BY_JUNK
-    return LEAST_OF_GUESS if materials <= FEW else LEAST_OF_FEW
+        return {"balanced": LEAST_BY_JUNK}
+    return {"balanced": LEAST_OF_GUESS if materials <= FEW else LEAST_OF_FEW}
 
 
 def _by_condition(
