@@ -184,11 +184,11 @@ def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser, shown):
     until(lambda: age_s() > before)
     shown.board.take(feed_lines.hello(pid=72, bundle="aaaa0001"))
     shown.board.take(feed_lines.health(NOW_S, pid=72, bundle="aaaa0001", model="tubes 4, 6 labels"))
-    until(lambda: not seen.page.is_visible("#banner"))
+    until(lambda: seen.text("#bundle") == "tubes 4, 6 labels")  # of the second line
+    assert not seen.page.is_visible("#banner")
     assert seen.text("#state") == "ready"
     assert seen.text("#label") == "Ready"
     assert seen.text("#advice").startswith("No sweep yet")
-    assert seen.text("#bundle") == "tubes 4, 6 labels"
     assert "aaaa0001" in seen.text(".note")
     assert seen.page.locator(".row").count() == 40
     assert not seen.errors
@@ -210,7 +210,7 @@ def test_a_page_program_that_dies_and_comes_back(browser):
         second.board.take(feed_lines.health(NOW_S))
         until(lambda: not seen.page.is_visible("#banner"))
         until(lambda: seen.page.locator(".row").count() == 0)
-        assert seen.text("#state") == "ready"
+        until(lambda: seen.text("#state") == "ready")
 
 
 def test_it_is_used_with_the_keyboard(browser, shown):
