@@ -168,8 +168,9 @@ class ObjectSweeps:
         return self.present if same else FusedSweeps(sweep.object)
 
     def joined(self, context: Context) -> Array | None:
-        """The mean of Context.doubtful of a sweep and of the sweep before it, if both are doubtful
-        and of one object; None if not."""
+        """The mean of Context.doubtful of a doubtful sweep and of the sweep before it, if that is
+        doubtful, too, and of one object; None if not. The context gets `own` and `after`: a replay
+        finds by them what the answer may depend on."""
         earlier, own = self.earlier(context.sweep), context.doubtful
         context.own, context.after = softmax(context.logits), earlier.last
         last = earlier.doubtful
@@ -179,9 +180,10 @@ class ObjectSweeps:
             return None
         return (own + last.far) / 2
 
-    def doubted(self, sweep: Sweep, far: Array) -> None:
-        """Remember a sweep that is unknown and doubtful, with its Context.doubtful."""
-        last = FusedSweeps(sweep.object, end_ns=sweep.stop_ns, far=far)
+    def doubted(self, context: Context) -> None:
+        """Remember a sweep that is unknown and doubtful."""
+        sweep = context.sweep
+        last = FusedSweeps(sweep.object, end_ns=sweep.stop_ns, far=context.doubtful)
         self.present = replace(self.earlier(sweep), last=sweep.id, doubtful=last)
 
     def apply(self, context: Context) -> Refusal | None:

@@ -345,7 +345,7 @@ class KnownMaterial:
         if far[k] <= limit:
             return None
         if len(context.doubtful):
-            self._objects.doubted(context.sweep, context.doubtful)
+            self._objects.doubted(context)
         novelty = {"distance": float(far[k]), "label": means.labels[k], "limit": limit}
         # a golden sweep has no number, and nobody touched it
         if not off and context.sweep.id and (alike := self._keep(context.sweep.id, z)):

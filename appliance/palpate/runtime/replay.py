@@ -277,21 +277,23 @@ def main(argv: Sequence[str]) -> int:
 
 def _beyond(was: dict[str, Any], found: ReplayResult) -> str:
     """The change of an answer if it is larger than the tolerance, else ""."""
-    now, own = found.verdict, found.alone
-    if own is None:
-        if now is None:
-            return "it is not answered any more"
-        own = now.own
-    before = np.asarray(was.get("own", []), np.float64)
-    same = before.shape == own.shape and np.allclose(before, own, 0, GOLDEN_TOLERANCE)
-    if found.alone is None:
-        statuses = {was.get("status"), now and now.status}
+    now, before = found.verdict, np.asarray(was.get("own", []), np.float64)
+    if found.alone is not None:
+        same = _near(before, found.alone)
+    elif now is None:
+        return "it is not answered any more"
+    else:
+        statuses = {was.get("status"), now.status}
         # near a limit, "ok" may become "unsure", and an unknown sweep may have no probabilities
-        same = same and (len(statuses) == 1 or statuses <= CLASSIFIED)
-        same = same or (statuses == {Status.UNKNOWN} and not (len(before) and len(own)))
+        same = _near(before, now.own) and (len(statuses) == 1 or statuses <= CLASSIFIED)
+        same = same or (statuses == {Status.UNKNOWN} and not (len(before) and len(now.own)))
     if same:
         return ""
     return f"it was {_said(was)}, and is {_said(now.as_dict()) if now else 'not answered'}"
+
+
+def _near(before: NDArray[np.float64], own: NDArray[np.float64]) -> bool:
+    return before.shape == own.shape and np.allclose(before, own, 0, GOLDEN_TOLERANCE)
 
 
 def _shift(was: dict[str, Any], now: Verdict) -> float:

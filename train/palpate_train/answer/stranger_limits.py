@@ -185,8 +185,8 @@ def limits(
     spread = np.linspace(np.argmax(kept >= LEAST_KEPT["strict"]), most, DRAWN).round().astype(int)
     figures: dict[str, Any] = {
         "under": list(left_out),
-        "known": _sweeps(one.known for one in left_out.values()),
-        "strangers": _sweeps(one.strangers for one in left_out.values()),
+        "known": _judging(one.known for one in left_out.values()),
+        "strangers": _judging(one.strangers for one in left_out.values()),
         "guess": len(known.by_material) <= FEW,
         "curve": np.round(np.stack([kept, named], 1)[spread], 4).tolist(),
     } | _by_condition(left_out, grid[spread], chosen)
@@ -224,7 +224,7 @@ def _by_condition(
     return {"by condition": judged}
 
 
-def _sweeps(distances: Iterable[Array]) -> int:
+def _judging(distances: Iterable[Array]) -> int:
     """The number of sweeps that judge under one condition at least."""
     judged: Array = np.any([np.isfinite(of) for of in distances], axis=0)
     return int(judged.sum())
